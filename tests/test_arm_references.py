@@ -154,6 +154,77 @@ def test_slower_moves_are_no_advice_where_the_weight_alone_is_too_much() -> None
         planned(slow, model=EXAMPLE, joints=joints, home={"shoulder": 1.3, "elbow": 0.2})
 
 
+def weak_arm(geom: str, torque: float, axis: str = "0 1 0", more: str = "") -> str:
+    """An arm whose last joint has a motor of little torque [N·m]."""
+    return (
+        '<mujoco><compiler angle="radian"/><default><geom type="capsule" size="0.05" mass="1"/>'
+        f"</default><worldbody><body name='upper'>{more}<body name='lower' pos='0 0 1'>"
+        f"<joint name='last' axis='{axis}' range='-2.4 2.4'/><geom fromto='{geom}'/></body>"
+        "</body></worldbody><actuator><motor joint='last' ctrlrange='-1 1'"
+        f" gear='{torque}'/></actuator></mujoco>"
+    )
+
+
+UPRIGHT = weak_arm(
+    "0 0 0 0 0 1",
+    torque=2.0,
+    more="<joint name='first' axis='0 1 0'/><geom fromto='0 0 0 0 0 1'/>",
+)
+"""Its servo holds some poses, and not what lies between them."""
+LEVEL = weak_arm("0 0 0 1 0 0", torque=4.5)
+"""Its servo does not hold it at home."""
+VERTICAL = weak_arm("0 0 0 1 0 0", torque=0.25, axis="0 0 1")
+"""Its servo holds every pose, and takes longer from one to the next."""
+
+
+@pytest.mark.filterwarnings("ignore:assumed")
+@pytest.mark.parametrize("kind", ["poses", "moves"])
+@pytest.mark.parametrize("model", [UPRIGHT, LEVEL, VERTICAL])
+def test_weak_servos_follow_the_poses_of_their_own_robot(model: str, kind: str) -> None:
+    """Catches a robot that is refused for a motion that nobody chose. MuJoCo's inverse dynamics
+    are the judge."""
+    with pytest.warns(
+        UserWarning, match=rf"too weak for the usual '{kind}'; .*(home is moved|drawn within)"
+    ):
+        plant, plan = planned(kind, model=model, joints={"*": 2000.0})
+    rigid = mujoco.MjModel.from_xml_string(model)
+    rigid.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
+    data = mujoco.MjData(rigid)
+    last = []
+    for data.qpos[:], data.qvel[:], data.qacc[:] in zip(
+        plan.q, plan.q_dot, plan.q_ddot, strict=True
+    ):
+        mujoco.mj_inverse(rigid, data)
+        last.append(data.qfrc_inverse[-1] + plant.true.rotor_inertia[-1] * data.qacc[-1])
+    assert np.abs(last).max() <= rigid.actuator_gear[0, 0]
+    assert np.ptp(plan.q[:, -1]) > 0.005
+    assert np.abs(plan.q[:, -1]).max() < 2.4
+
+
+@pytest.mark.filterwarnings("ignore:assumed")
+def test_what_is_chosen_for_weak_servos_is_not_changed() -> None:
+    """Catches poses, moves and a home that are others than the user asked for."""
+    level: dict[str, Any] = {"model": LEVEL, "joints": {"*": 2000.0}}
+    vertical = {**level, "model": VERTICAL}
+    for arguments, message in (
+        ({**vertical, "reference": {"kind": "poses", "move_s": 1.9}}, "make its moves slower"),
+        ({**vertical, "reference": {"kind": "poses", "within_rad": 1.0}}, "make its moves slower"),
+        ({**level, "reference": "poses", "home": [0.0]}, "hold hardly any pose|weight alone"),
+    ):
+        with pytest.raises(ConfigurationError, match=message):
+            planned(**arguments)
+    _, plan = planned({"kind": "poses", "within_rad": 0.1})
+    assert np.abs(plan.q - plan.q[0]).max() <= 0.1
+
+
+def test_servos_that_hold_no_pose_near_home_are_named() -> None:
+    """Catches a refusal that says neither which servo is weak nor by how much."""
+    message = r"takes 4\.90\d N·m of the servo of joint 'last', which is limited to 1 N·m"
+    weak = LEVEL.replace("gear='4.5'", "gear='1'").replace("range='-2.4 2.4'", "range='-1 1'")
+    with pytest.raises(ConfigurationError, match=message):
+        planned("poses", model=weak, joints={"*": 2000.0})
+
+
 def errors_at_poses(
     policy: str, model: str, positions: int, worlds: int, scenario: str
 ) -> dict[str, Array]:

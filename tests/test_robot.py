@@ -169,7 +169,10 @@ NO_MESH = (
         ({"model": "<mujoco>"}, r"is no XML"),
         (
             {"joints": {"*": 1e12}},
-            r"too stiff.*explode with a physics step of 4e-06 s.*less stiffness, or more rotor",
+            (
+                r"too stiff.*explode with a physics step of 4e-06 s.*less stiffness, or more rotor"
+                r".*fastest are those of joint 'wrist': .* kg·m² on a spring of 1e.12 N·m/rad"
+            ),
         ),
         ({"model": NO_HINGE}, r"the model has no hinge.*rotary joints"),
         ({"model": FLOATS}, r"joint 'a' is free or a ball joint; a fixed base"),
@@ -218,6 +221,18 @@ def test_what_cannot_be_says_what_to_do(arguments: dict[str, Any], message: str)
     """Catches tracebacks of MuJoCo, and models that are played as something else than they are."""
     with pytest.raises(ConfigurationError, match=message):
         scalar(**arguments)
+
+
+def test_bodies_without_names_get_some_where_no_hinge_moves_a_named_one() -> None:
+    """Catches an arm that is refused as only its carriage has a name."""
+    arm = (
+        "<mujoco><worldbody><body name='body_2'><joint type='slide'/><geom size='0.1'/><body>"
+        "<joint name='a' axis='0 1 0'/><geom size='0.1' pos='0.2 0 0'/><body pos='0.4 0 0'>"
+        "<joint name='b' axis='0 1 0'/><geom size='0.1' pos='0.2 0 0'/></body></body></body>"
+        "</worldbody></mujoco>"
+    )
+    config = configure_robot(arm, {"*": 500.0})
+    assert config.robot.end_effector == "body_3"
 
 
 def test_what_holds_is_taken_out_without_a_word() -> None:

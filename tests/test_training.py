@@ -185,6 +185,33 @@ def test_the_reward_per_decision_counts_whole_episodes(tmp_path: Path) -> None:
     assert (step, value) == (7, -8.0)
 
 
+def test_episodes_that_checkpoints_end_have_their_reward_per_decision(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Catches a curve without a point, as every checkpoint ends the episodes before one is whole,
+    and a last point of fewer decisions than the others."""
+    settings = {"decision_period": 25, "history": 1}
+    sizes = {"decisions": 160, "checkpoint_every": 64}
+    training = Training(TrainConfig(**{**SMALL, **PPO, **sizes, "settings": settings}), 1, tmp_path)
+    rewards = []
+    step = training._worlds.env.step
+
+    def kept(actions: Any) -> Any:
+        result = step(actions)
+        rewards.append(result[1].mean())
+        return result
+
+    monkeypatch.setattr(training._worlds.env, "step", kept)
+    training.run()
+    events = EventAccumulator(str(tmp_path / "tensorboard")).Reload()
+    shown = [(event.step, event.value) for event in events.Scalars("rollout/reward_per_decision")]
+    assert shown == [
+        (64, pytest.approx(np.mean(rewards[:16]), rel=1e-6)),
+        (128, pytest.approx(np.mean(rewards[16:32]), rel=1e-6)),
+    ]
+    assert shown[0][1] < 0.0
+
+
 def test_an_episode_that_is_cut_short_has_no_statistics() -> None:
     """Catches first episodes, which are cut and of the beginning of the motion, in a mean with
     whole ones."""

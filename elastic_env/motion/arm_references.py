@@ -31,6 +31,16 @@ _MOST_ROWS = 2_000_000
 _HALF_TURN = np.pi / 2
 _MARGIN = 0.1
 """Share of a joint's range that drawn poses keep from either end."""
+_ROUNDS = 200
+_NEARBY = 64
+_STRIDE = 0.05
+"""Of a search for a pose that servos hold: rounds, poses drawn in each, and how far apart, as a
+share of the range.
+"""
+
+
+class WeakServosError(ConfigurationError):
+    """Servos have too little torque for a motion."""
 
 
 @dataclass(frozen=True)
@@ -42,6 +52,8 @@ class Workspace:
         lowest, highest: Ranges of the joints, infinite where there is none, (n,) [rad].
         home: Angles about which the robot moves, (n,) [rad].
         holds: Whether the servos hold poses at rest, from (..., n) [rad] to (...).
+        lack: Torque that the servos lack for that, over what they have, summed over the joints;
+            from (..., n) [rad] to (...) [1].
         end_effector: Where the tool is; None for a robot without one.
     """
 
@@ -50,20 +62,27 @@ class Workspace:
     highest: Array
     home: Array
     holds: Any
+    lack: Any
     end_effector: EndEffector | None
 
-    def poses(self, generator: np.random.Generator, count: int) -> Array:
-        """Poses that the servos hold, evenly over the joint angles, (count, n) [rad].
+    def around_home(self, within_rad: float = _HALF_TURN) -> tuple[Array, Array]:
+        """Lowest and highest angles of drawn poses, (n,) each [rad].
 
-        They keep a tenth of the range from its ends, and lie within a quarter turn of home.
-
-        Raises:
-            ConfigurationError: The servos are too weak for almost all poses.
+        They keep a tenth of the range from its ends, and lie within an angle of home.
         """
         extent = self.highest - self.lowest
         width = np.where(np.isfinite(extent), _MARGIN * extent, _MARGIN)
-        low = np.maximum(self.lowest + width, self.home - _HALF_TURN)
-        high = np.minimum(self.highest - width, self.home + _HALF_TURN)
+        low = np.maximum(self.lowest + width, self.home - within_rad)
+        high = np.minimum(self.highest - width, self.home + within_rad)
+        return low, high
+
+    def poses(self, generator: np.random.Generator, count: int, within_rad: float) -> Array:
+        """Poses that the servos hold, evenly over the joint angles, (count, n) [rad].
+
+        Raises:
+            WeakServosError: The servos are too weak for almost all poses.
+        """
+        low, high = self.around_home(within_rad)
         n = len(self.home)
         found = np.empty((0, n))
         for _ in range(_TRIES):
@@ -71,9 +90,32 @@ class Workspace:
             found = np.concatenate([found, drawn[self.holds(drawn)]])[:count]
             if len(found) == count:
                 return found
-        raise ConfigurationError(
+        raise WeakServosError(
             "the servos hold hardly any pose of the workspace; give them a larger torque_limit"
         )
+
+    def held_home(self) -> Array | None:
+        """Home, or else a pose near it that the servos hold, (n,) [rad]; None if none is found."""
+        generator = np.random.default_rng(0)
+        low, high = self.around_home()
+        stride = _STRIDE * np.maximum(high - low, 0.0)
+        pose = self.home
+        for _ in range(_ROUNDS):
+            if self.holds(pose):
+                return self._closer(pose)
+            drawn = pose + stride * generator.standard_normal((_NEARBY, len(pose)))
+            nearby = np.vstack([pose, np.clip(drawn, low, high)])
+            pose = nearby[self.lack(nearby).argmin()]
+        return None
+
+    def _closer(self, pose: Array) -> Array:
+        """A pose that servos hold, with every joint at home that need not leave it, (n,) [rad]."""
+        for joint, angle in enumerate(self.home):
+            returned = pose.copy()
+            returned[joint] = angle
+            if self.holds(returned):
+                pose = returned
+        return pose
 
 
 class _Drawn(RepeatableReference):
@@ -83,6 +125,8 @@ class _Drawn(RepeatableReference):
     """Number of poses [1]."""
     move_s: float = quantity("s", 2.0, gt=0, le=600)
     """Duration of a move [s]."""
+    within_rad: float = quantity("rad", _HALF_TURN, gt=0, le=_HALF_TURN)
+    """Largest angle between a joint's home and its poses [rad]."""
     seed: int | None = quantity("1", 0, ge=0, le=LARGEST_SEED)
     """Seed of the poses; None draws new ones per episode [1]."""
 
@@ -272,7 +316,8 @@ def _plan(
     period_s: float,
 ) -> Plan:
     if isinstance(reference, Poses | Moves):
-        poses = workspace.poses(reference.own(generator), reference.positions)
+        own = reference.own(generator)
+        poses = workspace.poses(own, reference.positions, reference.within_rad)
         return reference.through(np.vstack([workspace.home, poses]), period_s)
     if isinstance(reference, OfArm):
         return reference.joint_plan(workspace, period_s)

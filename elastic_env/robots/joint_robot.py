@@ -11,7 +11,7 @@ not walk.
 
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -28,6 +28,7 @@ from elastic_env.joint.make_elastic import transform_hinges
 from elastic_env.motion import arm_references
 from elastic_env.motion.arm_references import AnyArmReference, ArmReference, Workspace
 from elastic_env.motion.references import Multisine
+from elastic_env.motion.trajectory import Motion
 from elastic_env.registration import Robot, as_model
 from elastic_env.rendering.picture import CAMERA, Picture, set_stage
 from elastic_env.rendering.side_by_side import Alone, Sides
@@ -46,6 +47,8 @@ _REFERENCE = "elastic_env_reference_"
 """Prefix of the names of the robot that is the reference."""
 _SPARE = 0.8
 """Share of the servos' torque that poses may need at rest."""
+_HALVINGS = 12
+"""How often the extent of poses is halved until servos can follow them."""
 _POINT = 1e-4
 """Moment of inertia of a point mass over its mass: that of a ball of 16 mm [m²]."""
 
@@ -140,9 +143,72 @@ class JointRobot:
             ConfigurationError: The reference needs more torque than the servos have, or a sensor
                 has no place.
         """
-        period_s = config.control_period_s
+        true, body, workspace = self._built(config)
+        motion, q = _followed(config, true, body, workspace)
+        rigid = self.rigid().compile()
+        assumed = RobotModel(config.known_joints, rigid, config.control_period_s)
+        _warn_of_action_bound(config, assumed, body.gravity_torque(q))
+        return JointPlant(
+            name=self.name,
+            model=self.elastic(config).compile(),
+            assumed=assumed,
+            true=true,
+            form=config.form,
+            static_torque=body.gravity_torque,
+            torque_gradient=body.gravity_gradient,
+            motion=motion,
+            end_effector=workspace.end_effector,
+        )
+
+    def within_torque(self, config: "JointRobotConfig", moves_home: bool) -> "JointRobotConfig":
+        """The configuration, with poses closer to home where its servos cannot follow others.
+
+        Only where neither the extent of the poses nor the duration of the moves is chosen.
+
+        Args:
+            config: Its reference may be poses or moves.
+            moves_home: Home may be moved to where the servos hold it.
+
+        Raises:
+            ConfigurationError: The servos do not hold the robot's weight anywhere near its home.
+
+        Warns:
+            UserWarning: Something is changed.
+        """
+        reference = config.reference
+        if not isinstance(reference, arm_references.Poses | arm_references.Moves):
+            return config
+        default = type(reference)()
+        if (reference.move_s, reference.within_rad) != (default.move_s, default.within_rad):
+            return config
+        true, body, workspace = self._built(config)
+        try:
+            _followed(config, true, body, workspace)
+        except arm_references.WeakServosError as error:
+            weak = error
+        else:
+            return config
+        home = workspace.held_home() if moves_home else workspace.home
+        if home is None:
+            raise _unheld(true, body, workspace.home)
+        workspace = replace(workspace, home=home)
+        for halvings in range(_HALVINGS):
+            near = reference.replace(within_rad=default.within_rad / 2**halvings)
+            changed = config.replace(
+                reference=near, robot=replace(config.robot, home=home.tolist())
+            )
+            try:
+                _followed(changed, true, body, workspace)
+            except arm_references.WeakServosError:
+                continue
+            _warn_of_near_poses(true.joint_names, near, config.robot.home, home)
+            return changed
+        raise weak
+
+    def _built(self, config: "JointRobotConfig") -> tuple[RobotModel, RigidBody, Workspace]:
+        """The robot as it is built, its links, and what its references know of it."""
         loaded = self._loaded(config).compile()
-        true = RobotModel(config.true_joints, loaded, period_s)
+        true = RobotModel(config.true_joints, loaded, config.control_period_s)
         names = true.joint_names
         n = len(names)
         body = RigidBody(loaded, names)
@@ -156,26 +222,9 @@ class JointRobot:
             tool = EndEffector(loaded, names, self.end_effector)
         lowest, highest = joint_ranges(true.rigid, names)
         holds = partial(_holds, true, body)
-        workspace = Workspace(tuple(names), lowest, highest, home, holds, tool)
-        motion = arm_references.motion_of(config.reference, workspace)
-        plan = motion.plan(np.random.default_rng(0), period_s)
-        rows = slice(None, None, max(plan.num_steps // 500, 1))
-        q = np.ascontiguousarray(plan.q[rows])
-        _require_in_range(config, true, q)
-        _require_torque(config, true, body, (q, plan.q_dot[rows], plan.q_ddot[rows]))
-        assumed = RobotModel(config.known_joints, self.rigid().compile(), period_s)
-        _warn_of_action_bound(config, assumed, body.gravity_torque(q))
-        return JointPlant(
-            name=self.name,
-            model=self.elastic(config).compile(),
-            assumed=assumed,
-            true=true,
-            form=config.form,
-            static_torque=body.gravity_torque,
-            torque_gradient=body.gravity_gradient,
-            motion=motion,
-            end_effector=tool,
-        )
+        lack = partial(_lack, true, body)
+        workspace = Workspace(tuple(names), lowest, highest, home, holds, lack, tool)
+        return true, body, workspace
 
     def elastic(self, config: "JointRobotConfig") -> MjSpec:
         """The plant: the model with the scenario's load, with elastic joints, and with sensors.
@@ -320,6 +369,67 @@ def _holds(robot: RobotModel, body: RigidBody, q: Array) -> BoolArray:
     return np.all(needed < _SPARE * robot.largest_torque(np.zeros_like(q)), axis=-1)
 
 
+def _lack(robot: RobotModel, body: RigidBody, q: Array) -> Array:
+    """What servos lack to hold poses as `_holds` asks, over their torque; (..., n) to (...)."""
+    limits = robot.largest_torque(np.zeros_like(q))
+    needed = robot.largest_passed_torque(body.gravity_torque(q))
+    return np.maximum(needed / limits - _SPARE, 0.0).sum(axis=-1)
+
+
+def _unheld(robot: RobotModel, body: RigidBody, home: Array) -> ConfigurationError:
+    """Servos that do not hold the robot at its home."""
+    limits = robot.largest_torque(np.zeros_like(home))
+    needed = robot.largest_passed_torque(body.gravity_torque(home))
+    weakest = int((needed / limits).argmax())
+    return arm_references.WeakServosError(
+        f"at home the weight takes {needed[weakest]:.4g} N·m of the servo of joint"
+        f" {robot.joint_names[weakest]!r}, which is limited to {limits[weakest]:.4g} N·m, and no"
+        " pose near home was found that is held with a fifth to spare: a simulated robot would"
+        " sink; raise its torque_limit, or choose another home"
+    )
+
+
+def _warn_of_near_poses(
+    names: Sequence[str],
+    near: arm_references.Poses | arm_references.Moves,
+    before: Sequence[float] | None,
+    home: Array,
+) -> None:
+    """Say which poses are played, where the servos are too weak for the usual ones."""
+    changes = []
+    moved = np.abs(home - (0.0 if before is None else np.array(before)))
+    most = int(moved.argmax())
+    if moved[most] > 0.0:
+        where = "to where the servos hold it"
+        changes.append(
+            f"home is moved {where}, by up to {moved[most]:.3g} rad (joint {names[most]!r})"
+        )
+    if near.within_rad < type(near)().within_rad:
+        changes.append(f"poses are drawn within {near.within_rad:.3g} rad of home")
+    warnings.warn(
+        f"the servos are too weak for the usual {near.kind!r}; {' and '.join(changes)}. To choose"
+        " them, give within_rad, move_s or home",
+        stacklevel=4,
+    )
+
+
+def _followed(
+    config: "JointRobotConfig", robot: RobotModel, body: RigidBody, workspace: Workspace
+) -> tuple[Motion, Array]:
+    """The motion of a robot, and angles along it, (T, n) [rad].
+
+    Raises:
+        ConfigurationError: It leaves the joint ranges, or needs more torque than the servos have.
+    """
+    motion = arm_references.motion_of(config.reference, workspace)
+    plan = motion.plan(np.random.default_rng(0), config.control_period_s)
+    rows = slice(None, None, max(plan.num_steps // 500, 1))
+    q = np.ascontiguousarray(plan.q[rows])
+    _require_in_range(config, robot, q)
+    _require_torque(config, robot, body, (q, plan.q_dot[rows], plan.q_ddot[rows]))
+    return motion, q
+
+
 def _require_torque(
     config: "JointRobotConfig",
     robot: RobotModel,
@@ -345,7 +455,7 @@ def _require_torque(
         cure = "make its moves slower"
         if np.any((resting > enough)[:, weakest[-1]]):
             cure = "the weight alone is too much: raise its torque_limit, or choose other poses"
-        raise ConfigurationError(
+        raise arm_references.WeakServosError(
             f"the reference {config.reference.kind!r} can need {needed[weakest]:.4g} N·m of the"
             f" servo of joint {robot.joint_names[weakest[-1]]!r}, which is limited to"
             f" {limits[weakest]:.4g} N·m; {cure}"

@@ -46,6 +46,8 @@ class SB3VecEnv(VecEnv):
         self._actions: Any = None
         self._reward = np.zeros(env.num_envs)
         self._length = np.zeros(env.num_envs, dtype=np.int64)
+        self._total = 0.0
+        self._steps = 0
         spaces = (env.single_observation_space, env.single_action_space)
         super().__init__(env.num_envs, *spaces)
 
@@ -59,6 +61,8 @@ class SB3VecEnv(VecEnv):
         self._reset_options()
         self._reward[:] = 0.0
         self._length[:] = 0
+        self._total = 0.0
+        self._steps = 0
         return observation
 
     def begin_with(self, seed: int, stagger: np.random.Generator) -> None:
@@ -82,6 +86,8 @@ class SB3VecEnv(VecEnv):
         done = terminated | truncated
         self._reward += reward
         self._length += 1
+        self._total += float(reward.sum())
+        self._steps += self.num_envs
         # worlds that go on share an empty info: SB3 only reads those that end
         infos: list[dict[str, Any]] = [_NOTHING] * self.num_envs
         if done.any():
@@ -107,9 +113,8 @@ class SB3VecEnv(VecEnv):
 
     @property
     def reward_per_decision(self) -> float | None:
-        """Mean reward of the steps of the present episodes; None before the first one."""
-        steps = int(self._length.sum())
-        return float(self._reward.sum()) / steps if steps else None
+        """Mean reward of the steps since the last `reset`; None before the first one."""
+        return self._total / self._steps if self._steps else None
 
     def close(self) -> None:
         """Close the environment."""

@@ -55,6 +55,8 @@ class Training(Trainer):
         ConfigurationError: Names or options that do not exist.
     """
 
+    _shown: "Curves | None" = None
+
     def _prepare(self, threads: int) -> None:
         torch.set_num_threads(1)  # more would fight the threads of the physics
         torch.use_deterministic_algorithms(True)
@@ -98,13 +100,13 @@ class Training(Trainer):
         """
         curves = Curves(str(self.folder / "tensorboard"), self.model, self._worlds)
         self.model.set_logger(curves)
+        self._shown = curves
         try:
             yield
         except BaseException:
             with suppress(Exception):  # what ended the work is what is said
                 curves.close()
             raise
-        curves.finish(self.done)
         curves.close()
 
     @property
@@ -196,7 +198,11 @@ class Training(Trainer):
 
     def checkpoint(self) -> None:
         """Keep everything but the state of the worlds: a checkpoint ends their episodes."""
+        before = self._kept
         super().checkpoint()
+        share = (self.done - (before or 0)) / self.config.checkpoint_every
+        if self._shown is not None and (before is None or share > _WHOLE):
+            self._shown.end_episodes(self.done)
         self._begin_episodes()
 
     def _begin_episodes(self) -> None:
@@ -279,6 +285,10 @@ def _to_tuples(value: Any) -> Any:
     return tuple(map(_to_tuples, value)) if isinstance(value, list) else value
 
 
+_WHOLE = 0.9
+"""Share of the decisions between checkpoints that the last of them must have for its mean reward
+to be comparable.
+"""
 _REWARD = "rollout/reward_per_decision"
 _MISLEADING = "rollout/ep_rew_mean"
 """Sum of rewards of an episode: each is a penalty, so that an episode which ends early would
@@ -290,7 +300,9 @@ class Curves(Logger):
     """SB3's logger with the reward per decision in the place of that per episode.
 
     It is the mean over the last whole episodes. Those that were cut short to spread the worlds over
-    the motion do not count, since their decisions are of its beginning alone.
+    the motion do not count, since their decisions are of its beginning alone. Where every
+    checkpoint ends the episodes before one is whole, it is the mean between checkpoints, whose
+    decisions are of the same parts of the motion.
 
     Args:
         folder: Of TensorBoard's files.
@@ -313,8 +325,8 @@ class Curves(Logger):
             self.record(_REWARD, sum(episode["r"] for episode in episodes) / decisions)
         super().dump(step)
 
-    def finish(self, step: int) -> None:
-        """Write the reward per decision of the present episodes, where no whole one has ended."""
+    def end_episodes(self, step: int) -> None:
+        """Write the reward per decision since the episodes began, where no whole one has ended."""
         reward = self._worlds.reward_per_decision
         if not self._model.ep_info_buffer and reward is not None:
             self.record(_REWARD, reward)

@@ -73,7 +73,8 @@ def configure_robot(
         scenario: Name as in `elastic_env.world.scenario`, or a `Scenario`.
         end_effector: Site or body whose place and tilt are scored; default the outermost body.
         home: Angle about which each joint follows the reference, by name or in order [rad]; default
-            the model's first keyframe, or its reference, within the joint ranges.
+            the model's first keyframe, or its reference, within the joint ranges, or near there
+            where the servos hold it.
         load_kg: The scenario `payload` adds a fifth of this mass at the end effector [kg]; default
             the mass that the joints carry.
         imu: Site of the accelerometer.
@@ -109,15 +110,19 @@ def configure_robot(
         timestep_s=timestep_s,
         action_bound_rad=action_bound_rad,
     )
+    settings = robot.within_torque(settings, moves_home=home is None)
     if timestep_s is None:
         period_s = settings.control_period_s
         model = compiled_spec(robot.elastic(settings), "the model with elastic joints")
         timestep_s = stable_timestep(stiffest_plant(model, settings.scenario), period_s)
         if timestep_s < (shortest_s := period_s / MOST_SUBSTEPS):
+            name, inertia = own_joints.lightest_links(robot.rigid().compile(), settings.joints)
             raise ConfigurationError(
-                "the joints are too stiff, or their links or rotors too light: they explode with"
-                f" a physics step of {shortest_s:g} s, the shortest that is played; give them less"
-                " stiffness, or more rotor_inertia"
+                "the joints are too stiff, or their links or rotors too light: in simulation they"
+                f" explode with a physics step of {shortest_s:g} s, the shortest that is played;"
+                " give them less stiffness, or more rotor_inertia. Of the links the fastest are"
+                f" those of joint {name!r}: {inertia:.3g} kg·m² on a spring of"
+                f" {settings.joints[name].stiffness:g} N·m/rad"
             )
         settings = settings.replace(timestep_s=timestep_s)
     return settings

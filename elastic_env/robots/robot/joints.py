@@ -177,6 +177,15 @@ def _inertias(model: MjModel, names: list[str], poses: Array) -> tuple[Array, Ar
     return least, most, together
 
 
+def lightest_links(model: MjModel, joints: Mapping[str, ElasticJoint]) -> tuple[str, float]:
+    """The joint whose links swing fastest on its spring, and their least inertia [kg·m²]."""
+    names = list(joints)
+    least, *_ = _inertias(model, names, drawn_poses(model, names))
+    stiffness = np.array([joint.stiffness for joint in joints.values()])
+    fastest = int((stiffness / least).argmax())
+    return names[fastest], float(least[fastest])
+
+
 @dataclass(frozen=True)
 class _Assumed:
     """One elastic joint: given, read from the model, or assumed within the scale of the model.

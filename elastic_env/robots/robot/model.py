@@ -1,6 +1,7 @@
 """The rigid model of a robot from a file of MJCF or URDF, with bodies that can be drawn."""
 
 import warnings
+from collections.abc import Iterator
 from typing import Any
 
 import mujoco
@@ -16,8 +17,8 @@ def read_robot(model: GivenModel) -> mujoco.MjSpec:
     """The specification of a robot, which compiles, see `read_model`.
 
     Collision shapes of a URDF are left out. What has a mesh that is missing, or that MuJoCo cannot
-    read, is drawn by rods between the joints. Bodies get numbers where none has a name, since the
-    end effector is one by name.
+    read, is drawn by rods between the joints. Bodies without a name get numbers where no body that
+    a hinge moves has a name, since the end effector is one by name.
 
     Args:
         model: File, text or specification; it is not changed.
@@ -39,10 +40,20 @@ def read_robot(model: GivenModel) -> mujoco.MjSpec:
         )
         add_simple_bodies(read.spec)
     bodies = read.spec.bodies[1:]
-    if not any(body.name for body in bodies):
+    if not any(body.name for body in _moved(read.spec)):
+        taken = {body.name for body in bodies}
         for number, body in enumerate(bodies, 1):
-            body.name = f"body_{number}"
+            if not body.name and (name := f"body_{number}") not in taken:
+                body.name = name
     return read.spec
+
+
+def _moved(spec: mujoco.MjSpec) -> Iterator[Any]:
+    """Bodies that a hinge moves; some of them several times."""
+    for joint in spec.joints:
+        if joint.type == mujoco.mjtJoint.mjJNT_HINGE:
+            yield joint.parent
+            yield from joint.parent.find_all("body")
 
 
 class RigidModel:
