@@ -7,7 +7,8 @@ the joints. What comes on top stands behind them: links on a fixed base, and a w
 Numba keeps compiled code by the file of the function that was called. So everything that a kernel
 calls stands in this file, and every size comes from a type or from an array. A kernel that Python
 calls takes plain tuples and names their parts itself: Numba takes a microsecond more for a tuple
-with names.
+with names. The control step compiles for a GPU too, see `tests.ptx`. So its functions return no
+part of an array, and what they allocate has a constant shape.
 """
 
 import math
@@ -21,6 +22,8 @@ from elastic_env.core.signals import Array, BoolArray, IntArray, Parameter
 FIRST_HALF = 1
 SECOND_HALF = 2
 """Of a swing; 0 is none."""
+EVERY_WORLD = (0, 1)
+"""First world of a call, and from one of its worlds to the next; a thread of a GPU has others."""
 
 
 class Step(NamedTuple):
@@ -85,7 +88,15 @@ class Control(NamedTuple):
 
 
 @compiled
-def command(step: Any, action: Array, bound: Array, is_clipped: BoolArray, inputs: Array) -> bool:
+def command(
+    step: Any,
+    action: Array,
+    bound: Array,
+    is_clipped: BoolArray,
+    inputs: Array,
+    first: int,
+    stride: int,
+) -> bool:
     """Servo inputs of the coming control period, q_ref + offset.
 
     Encoders are off by their homing error.
@@ -96,18 +107,20 @@ def command(step: Any, action: Array, bound: Array, is_clipped: BoolArray, input
         bound: Of every joint [rad].
         is_clipped: To be filled: worlds with an action beyond its bounds.
         inputs: To be filled [rad].
+        first: World that it begins with.
+        stride: From one of its worlds to the next, see `EVERY_WORLD`.
 
     Returns:
         Whether all offsets are finite; if not, no input is written.
     """
     step = step_of(*step)
-    for world in range(len(action)):
+    for world in range(first, len(action), stride):
         for i in range(len(bound)):
             if not np.isfinite(action[world, i]):
                 return False
-    for world in range(len(action)):
+    for world in range(first, len(action), stride):
         is_clipped[world] = False
-        coming = coming_motion(step, world)
+        coming = step.plans[coming_motion(step, world)]
         for i in range(len(bound)):
             value = action[world, i]
             offset = min(max(value, -bound[i]), bound[i])
@@ -120,10 +133,10 @@ def command(step: Any, action: Array, bound: Array, is_clipped: BoolArray, input
 
 
 @compiled
-def coming_motion(step: Step, world: int) -> Any:
-    """Angle, rate and acceleration of the reference at the end of the coming period, (3, n)."""
-    plan = step.plans[step.plan[world]]
-    return plan[min(step.worlds[world].truth.step + 1, len(plan) - 1)]
+def coming_motion(step: Step, world: int) -> tuple[int, int]:
+    """Which plan the reference at the end of the coming period is of, and which row of it."""
+    coming = step.worlds[world].truth.step + 1
+    return step.plan[world], min(coming, step.plans.shape[1] - 1)
 
 
 @compiled
@@ -147,12 +160,14 @@ def begin_joints(qpos: Array, qvel: Array, step: Step, world: int) -> None:
 
 
 @compiled
-def sense_joints(qpos: Array, qvel: Array, step: Step, control: Control) -> None:
+def sense_joints(
+    qpos: Array, qvel: Array, step: Step, control: Control, first: int, stride: int
+) -> None:
     """Joints after the physics of a control step: keep the command, read, measure, observe."""
     offset = control.offset
     diverged = control.diverged
     n = len(step.at)
-    for world in range(len(offset)):
+    for world in range(first, len(offset), stride):
         rules = step.rules[step.kind[world]]
         plan = step.plans[step.plan[world]]
         step.worlds[world] = step.last_worlds[world]
@@ -210,7 +225,7 @@ def observe_joints(step: Step, world: int, periods: float, observed: Array) -> N
     rules = step.rules[step.kind[world]]
     visible = step.last_joints[world] if rules.is_delayed else step.joints[world]
     period_s = rules.control_period_s * periods
-    coming = coming_motion(step, world)
+    coming = step.plans[coming_motion(step, world)]
     columns = step.columns[0]
     for i in range(len(step.at)):
         shown = visible[i].shown
@@ -265,7 +280,15 @@ def begin_links(qpos: Array, qvel: Array, step: Any, links: Any, worlds: BoolArr
 
 
 @compiled
-def sense_links(qpos: Array, qvel: Array, step: Any, links: Any, control: Any) -> bool:
+def sense_links(
+    qpos: Array,
+    qvel: Array,
+    step: Any,
+    links: Any,
+    control: Any,
+    first: int,
+    stride: int,
+) -> bool:
     """Everything after the physics where the base is fixed: read, measure, end, score, observe.
 
     Args:
@@ -274,6 +297,8 @@ def sense_links(qpos: Array, qvel: Array, step: Any, links: Any, control: Any) -
         step: `Step`.
         links: `Links`.
         control: `Control`.
+        first: World that it begins with.
+        stride: From one of its worlds to the next, see `EVERY_WORLD`.
 
     Returns:
         Whether an episode ends.
@@ -281,10 +306,10 @@ def sense_links(qpos: Array, qvel: Array, step: Any, links: Any, control: Any) -
     step = step_of(*step)
     links = Links(*links)
     control = Control(*control)
-    sense_joints(qpos, qvel, step, control)
+    sense_joints(qpos, qvel, step, control, first, stride)
     diverged = control.diverged
     is_over = False
-    for world in range(len(diverged)):
+    for world in range(first, len(diverged), stride):
         truth = step.worlds[world].truth
         shown = step.worlds[world].shown
         scores = step.worlds[world].scores
@@ -390,7 +415,7 @@ def begin_walk(physics: Any, step: Any, walker: Any, worlds: BoolArray) -> None:
 
 
 @compiled
-def sense_walk(physics: Any, step: Any, walker: Any, control: Any) -> bool:
+def sense_walk(physics: Any, step: Any, walker: Any, control: Any, first: int, stride: int) -> bool:
     """Everything after the physics in a walker: read, measure, end, score, observe.
 
     Args:
@@ -398,6 +423,8 @@ def sense_walk(physics: Any, step: Any, walker: Any, control: Any) -> bool:
         step: `Step`.
         walker: `Walker`.
         control: `Control`.
+        first: World that it begins with.
+        stride: From one of its worlds to the next, see `EVERY_WORLD`.
 
     Returns:
         Whether an episode ends.
@@ -406,10 +433,10 @@ def sense_walk(physics: Any, step: Any, walker: Any, control: Any) -> bool:
     step = step_of(*step)
     walker = Walker(*walker)
     control = Control(*control)
-    sense_joints(physics.qpos, physics.qvel, step, control)
+    sense_joints(physics.qpos, physics.qvel, step, control, first, stride)
     diverged = control.diverged
     is_over = False
-    for world in range(len(diverged)):
+    for world in range(first, len(diverged), stride):
         rules = walker.constants[step.kind[world]]
         truth = step.worlds[world].truth
         if truth.step == rules.skips_at:
@@ -843,7 +870,7 @@ def score(row: Any, planned: Any, weights: Any, is_failed: bool, terms: Any) -> 
 @compiled
 def tilt_penalty(tilt: Parameter) -> Any:
     """−|tilt| [rad]: linear, so that a large error never stops to matter."""
-    return -np.abs(tilt)
+    return -abs(tilt)
 
 
 @compiled

@@ -318,7 +318,9 @@ class JointTask(Task):
             diverged = control[2] | (np.abs(qvel) > DIVERGED_RAD_S).any(axis=1)
             q_dot = qvel[:, self._at["q_dot"][0]]
             self._imu.advance(~diverged, qpos[:, self._at["q"][0]], q_dot)
-        return kernels.sense_links(qpos, qvel, self._step, self._links, control)
+        return kernels.sense_links(
+            qpos, qvel, self._step, self._links, control, *kernels.EVERY_WORLD
+        )
 
     def _show_worlds(self, observed: Array) -> None:
         if self._imu_column >= 0:

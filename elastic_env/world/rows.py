@@ -24,8 +24,11 @@ WHOLE = np.int64
 
 
 def record_type(*fields: tuple[Any, ...]) -> np.dtype[Any]:
-    """A structured type whose records have their fields as attributes, compiled or not."""
-    return np.dtype((np.record, list(fields)))
+    """A structured type whose records have their fields as attributes, compiled or not.
+
+    Numbers are aligned, as a GPU reads no others.
+    """
+    return np.dtype((np.record, np.dtype(list(fields), align=True)))
 
 
 def reals(names: str, shape: int | tuple[int, ...] = ()) -> list[tuple[Any, ...]]:

@@ -363,7 +363,8 @@ class Task(ABC):
         offset = given.astype(np.float64, order="C")
         is_clipped = np.empty(self.num_worlds, dtype=np.bool_)
         inputs = self.simulation.ctrl
-        if not kernels.command(self._step, offset, self._bound, is_clipped, inputs):
+        arrays = (offset, self._bound, is_clipped, inputs)
+        if not kernels.command(self._step, *arrays, *kernels.EVERY_WORLD):
             raise self._refused(given.astype(np.float64))
         return offset, is_clipped
 

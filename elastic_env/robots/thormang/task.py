@@ -308,7 +308,8 @@ class WalkTask(Task):
         self._worlds[self._row]["scores"][worlds] = np.zeros((), records.SCORES)
 
     def _sense_worlds(self, control: tuple[Any, ...]) -> bool:
-        return kernels.sense_walk(self._physics, self._step, self._walker, control)
+        state = (self._physics, self._step, self._walker)
+        return kernels.sense_walk(*state, control, *kernels.EVERY_WORLD)
 
     def _show_worlds(self, observed: Array) -> None:
         kernels.show_walk(self._step, self._walker, observed)
