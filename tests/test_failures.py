@@ -228,7 +228,7 @@ def test_the_other_cells_of_a_comparison_are_kept(tmp_path: Path) -> None:
     run = elastic("compare", "cells.yaml", "--jobs", "1", cwd=tmp_path)
     assert run.returncode == 2, run.stderr
     assert "ZeroDivisionError" in run.stderr
-    assert "the other 1 cells are in runs/cells/episodes.csv" in run.stdout
+    assert "finished cells: 1, in runs/cells/episodes.csv" in run.stdout
     assert ",input,"[1:] in (tmp_path / "runs" / "cells" / "episodes.csv").read_text()
 
 
@@ -241,7 +241,7 @@ def test_what_had_been_played_before_a_worker_was_killed_is_kept(tmp_path: Path)
     assert run.returncode == 3, run.stderr
     assert "a worker process was killed" in run.stderr
     assert "Traceback" not in run.stderr
-    assert "the other 1 cells are in runs/cells/episodes.csv" in run.stdout
+    assert "finished cells: 1, in runs/cells/episodes.csv" in run.stdout
 
 
 def test_output_that_nobody_reads_is_no_traceback(tmp_path: Path) -> None:

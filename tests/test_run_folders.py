@@ -1,6 +1,7 @@
 """Folders of results: each for one program alone, and none elsewhere than where it should be."""
 
 import errno
+import json
 import os
 import platform
 import subprocess
@@ -16,7 +17,14 @@ from elastic_env.core.errors import ConfigurationError, SystemFailedError
 from elastic_env.core.files import read_bounded, write_whole
 from train.commands.compare import CompareConfig
 from train.learn.run_training import resume
-from train.runs.folders import free_folder, lock_run, require_run, run_folder
+from train.runs.folders import (
+    describe,
+    free_folder,
+    lock_run,
+    record_results,
+    require_run,
+    run_folder,
+)
 from train.runs.user_code import recorded_config
 
 
@@ -248,6 +256,32 @@ def test_a_broken_table_of_a_training_is_one_sentence(text: str, tmp_path: Path)
         match=r"progress\.csv (must be the table of a training|has no evaluations)",
     ):
         resume([tmp_path], Console(quiet=True))
+
+
+def test_results_of_another_configuration_do_not_stay(tmp_path: Path) -> None:
+    """Catches a report of policies that the configuration beside it no longer has, and a list of
+    files that removes others'."""
+    folder = tmp_path / "run"
+    folder.mkdir()
+    (tmp_path / "mine.txt").write_text("mine")
+    (folder / "notes.md").write_text("mine")
+    describe(folder, {"policy": "input"}, 0)
+    (folder / "report.md").write_text("input")
+    record_results(folder, [folder / "report.md"])
+    describe(folder, {"policy": "input"}, 0)
+    assert (folder / "report.md").is_file()
+    describe(folder, {"policy": "dynamic"}, 0)
+    assert not (folder / "report.md").exists()
+    for results in (["../mine.txt", "metadata.json", "config.yaml", "..", ".", 3, ["x"]], 7, "n"):
+        content = json.loads((folder / "metadata.json").read_text())
+        (folder / "metadata.json").write_text(json.dumps({**content, "results": results}))
+        describe(folder, {"policy": "zero"}, 0)
+        assert sorted(file.name for file in folder.iterdir()) == [
+            "config.yaml",
+            "metadata.json",
+            "notes.md",
+        ]
+    assert (tmp_path / "mine.txt").is_file()
 
 
 def test_a_run_may_be_a_link_and_have_links_to_itself(tmp_path: Path) -> None:

@@ -128,7 +128,9 @@ class SignalTable:
         found = [i for i, own in enumerate(self.names) if f"{own}.".startswith(start)]
         if not found:
             groups = dict.fromkeys(own.split(".")[0] for own in self.names)
-            raise unknown_name("signal", name, groups)
+            error = unknown_name("signal", name, groups)
+            error.add_note("an environment's argument `sensors` adds signals to an observation")
+            raise error
         if found != list(range(found[0], found[-1] + 1)):
             problem = f"the columns of {name!r} must be neighbours, they are {found}"
             raise ConfigurationError(problem)

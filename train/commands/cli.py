@@ -41,7 +41,8 @@ CONSOLE = PlainConsole()
 
 def _print_last(said: str, error: BaseException, before: str = "") -> None:
     """Say how the program ends, with the notes that its error got on the way."""
-    text = "; ".join([said, *getattr(error, "__notes__", [])])
+    notes = getattr(error, "__notes__", [])
+    text = "; ".join([said.removesuffix(".") if notes else said, *notes])
     PlainConsole(stderr=True).print(Text.assemble((before, "bold red"), text))
 
 

@@ -355,6 +355,7 @@ def compare(
         if report:
             parts = (rows, folder, axis, maps, board, robots)
             files += write_report(Results(config.name, evaluations, *parts))
+        folders.record_results(folder, files)
     print_summary(cells, console)
     print_robots(robots, console)
     print_changes(rows, console)
@@ -406,8 +407,7 @@ def _finished_kept(folder: Path, console: Console) -> Iterator[None]:
         if error.finished:
             write_summary(merge_seeds(error.finished), folder / "summary.md")
             kept = write_episodes(error.finished, folder / "episodes.csv")
-            number = len(error.finished)
-            console.print(f"the other {number} cells are in {kept} and summary.md")
+            console.print(f"finished cells: {len(error.finished)}, in {kept} and summary.md")
         raise
     except (KeyboardInterrupt, SystemFailedError, OSError) as error:
         if any((folder / CELLS).glob("*.npz")):

@@ -37,7 +37,7 @@ class Evaluate(Model):
     JointRobot."""
     scenario: str | None = None
     """Scenario, such as nominal (default), ideal, soft, stiff, spread, payload, backlash,
-    sensor, ideal+soft; on the walker also imu, push, slope, drawn, drawn_beyond."""
+    sensor, imu, drawn, drawn_beyond, ideal+soft; on the walker also push, slope."""
     reference: MotionOrDefault = None
     """Motion. Testbed: hold (default; takes 20 to 60 s), sine, multisine, steps (some
     seconds), or a mapping such as '{kind: sine, amplitude: 0.3}'. Walker: step period 24, 3
@@ -48,6 +48,9 @@ class Evaluate(Model):
     """Number of episodes, seeds following --seed."""
     seed: Seed = 0
     """Seed of the first episode."""
+    sensors: tuple[str, ...] = ()
+    """Further sensors of the environment, which a policy of one's own reads: joint_torque,
+    link_encoder, ..."""
     stiffness: Stiffness = None
     """K that the policy assumes: a number [N·m/rad], a list of one per joint
     such as '[1001]', twelve on the walker, or the path of an identification.json."""
@@ -60,12 +63,13 @@ class Evaluate(Model):
     def run(self, console: Console) -> None:
         """Play a comparison of one cell."""
         options = {} if self.stiffness is None else {"stiffness": self.stiffness}
+        observed = {"sensors": list(self.sensors)} if self.sensors else {}
         motion = {} if self.reference is None else {"references": [self.reference]}
         with name_options():
             config = CompareConfig(
                 name="evaluate",
                 scenarios=[self.on.scenario(self.scenario)],
-                policies=[PolicySpec(name=self.policy, options=options)],
+                policies=[PolicySpec(name=self.policy, options=options, env_options=observed)],
                 episodes=self.episodes,
                 seed=self.seed,
                 **motion,

@@ -10,7 +10,7 @@ import platform
 import stat
 import subprocess
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from importlib import metadata
@@ -41,9 +41,40 @@ _RECORDED = "elastic-env mujoco gymnasium pin numpy scipy stable-baselines3 torc
 
 
 def describe(folder: Path, configuration: dict[str, Any], seed: int | None) -> None:
-    """Write configuration (`config.yaml`), first seed, versions and commit (`metadata.json`)."""
-    write_whole(folder / CONFIG, yaml_of(configuration))
-    write_whole(folder / _METADATA, json.dumps(provenance(seed), indent=2) + "\n")
+    """Write configuration (`config.yaml`), first seed, versions and commit (`metadata.json`).
+
+    Results of another configuration, which the folder has recorded, are removed.
+    """
+    text = yaml_of(configuration)
+    results = _recorded_results(folder)
+    if results and (folder / CONFIG).read_text(encoding="utf-8") != text:
+        for name in results:
+            (folder / name).unlink(missing_ok=True)
+        results = []
+    write_whole(folder / CONFIG, text)
+    _write_metadata(folder, provenance(seed), results)
+
+
+def record_results(folder: Path, files: Iterable[Path]) -> None:
+    """Record what a run has written, so that it goes where the run goes on with another one."""
+    content = json.loads((folder / _METADATA).read_text(encoding="utf-8"))
+    _write_metadata(folder, content, sorted(file.name for file in files))
+
+
+def _write_metadata(folder: Path, content: dict[str, Any], results: list[str]) -> None:
+    content = {**content, "results": results} if results else content
+    write_whole(folder / _METADATA, json.dumps(content, indent=2) + "\n")
+
+
+def _recorded_results(folder: Path) -> list[str]:
+    """Names of files in a folder, which may come from anybody."""
+    try:
+        found = json.loads((folder / _METADATA).read_text(encoding="utf-8"))["results"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return []
+    named = found if isinstance(found, list) else []
+    present = {file.name for file in folder.iterdir() if file.is_file()}
+    return sorted(name for name in present - {CONFIG, _METADATA, _LOCK} if name in named)
 
 
 def require_run(folder: Path) -> Path:
