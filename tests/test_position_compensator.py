@@ -601,3 +601,26 @@ def test_a_payload_that_jumps_is_said_once_with_a_ramp() -> None:
     said = said_by(elsewhere)
     assert len(said) == 1
     assert "set the payload to 0 where it was, and let ramp_s pass" in said[0]
+
+
+def test_a_pose_that_no_servo_reaches_in_a_period_is_a_pose_and_no_motion() -> None:
+    """Catches a servo's lag at 100 rad/s, which turns every joint by the limit when poses follow
+    one another; a motion as fast as a servo turns is led."""
+    joint = {
+        "stiffness": 400.0,
+        "coulomb_friction": 0.1,
+        "servo": {"position_gain": 200.0, "velocity_gain": 10.0, "speed_limit": 6.0},
+    }
+    pendulum = mujoco.MjModel.from_xml_string(PENDULUM)
+
+    def led(poses: Sequence[float], **options: Any) -> float:
+        made = PositionCompensator.from_model(
+            pendulum, {"j": joint}, friction=True, period_s=0.01, limit_rad=0.5, **options
+        )
+        commands = [made.command([pose]) for pose in poses]
+        return float(commands[-1][0] - poses[-1])
+
+    at_rest = led([1.0, 1.0])
+    assert led([0.0, 1.0]) == pytest.approx(at_rest, abs=0.02)  # friction's side alone
+    moving = led([0.95, 1.0])  # 5 rad/s, 1/20 s behind
+    assert moving - at_rest == pytest.approx(0.25, abs=0.02)

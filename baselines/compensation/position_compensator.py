@@ -112,6 +112,7 @@ class CompensatorConstants:
         friction: What is known of dry friction; None where it is not compensated.
         viscous: Viscous friction, used with dry friction alone, (n,) [N·m·s/rad].
         lag_s: Lag of the servos, likewise, (n,) [s].
+        fastest: No-load speed of the servos, infinite where it is not known, (n,) [rad/s].
         rotor_s2: Lag behind an acceleration, B/k_p, likewise, (n,) [s²].
     """
 
@@ -128,6 +129,7 @@ class CompensatorConstants:
     friction: FrictionCompensation | None
     viscous: Array
     lag_s: Array
+    fastest: Array
     rotor_s2: Array
 
 
@@ -210,6 +212,7 @@ class PositionCompensator:
             friction=_friction(settings, friction),
             viscous=np.array([one.viscous_friction or 0.0 for one in own]),
             lag_s=np.array([one.servo.braking for one in own]) / gains,
+            fastest=np.array([one.servo.fastest for one in own]),
             rotor_s2=np.array([one.rotor_inertia or 0.0 for one in own]) / gains,
         )
         self._said: set[str] = set()
@@ -312,7 +315,8 @@ class PositionCompensator:
 
         Args:
             q_desired: Link angles, (n,) [rad].
-            q_dot: Their rates, (n,) [rad/s]; None at rest.
+            q_dot: Their rates, (n,) [rad/s]; None at rest. For dry friction they are then taken
+                from the last call, but for what is faster than a servo turns: a new pose.
             q_ddot: Their accelerations, (n,) [rad/s²]; None for none.
 
         Returns:
@@ -395,6 +399,7 @@ class PositionCompensator:
         self._rubbed = self.constants.friction.follow(displacement, self._rubbed)
         if q_dot is None:  # without what trembles
             q_dot = (displacement + slack - self._rubbed.slack) / self.constants.period_s
+            q_dot[np.abs(q_dot) > self.constants.fastest] = 0.0  # a pose of its own, no motion
         passed = self.constants.friction.passed(
             torque + self.constants.viscous * q_dot, q_dot, self._rubbed
         )

@@ -68,6 +68,13 @@ class ServoSettings(Model):
         """k_v and what the back-EMF adds to it, as far as they are known [N·m·s/rad]."""
         return (self.velocity_gain or 0.0) + (0.0 if self.motor is None else self.motor.damping)
 
+    @property
+    def fastest(self) -> float:
+        """No-load speed as far as it is known, else infinite [rad/s]."""
+        if self.speed_limit is not None:
+            return self.speed_limit
+        return float("inf") if self.motor is None else self.motor.no_load_speed
+
     def over(self, found: "ServoSettings") -> "ServoSettings":
         """These settings where they say something, else what was found in the model.
 

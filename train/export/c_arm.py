@@ -132,7 +132,7 @@ def _tables(constants: CompensatorConstants, frames: Sequence[Frame]) -> dict[st
     for owner, names in (
         (constants, "compliance of_command lowest highest"),
         (body, "spring spring_rest"),
-        (constants, "viscous lag_s rotor_s2"),
+        (constants, "viscous lag_s fastest rotor_s2"),
         (friction, "coulomb load_ratio static stribeck_speed dead_zone"),
     ):
         rows |= {name: getattr(owner, name) for name in names.split()}
