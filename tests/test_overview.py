@@ -9,6 +9,7 @@ import pytest
 from train.evaluate.conditions import Condition
 from train.evaluate.episodes import evaluate
 from train.figures import plots
+from train.report.summary import bound_notes
 
 PLAYED = {1.0: ["nominal", "payload"], 0.9: ["payload"], 0.8: ["soft"]}
 
@@ -40,3 +41,16 @@ def test_panels_name_the_scenarios_that_their_bars_are_of(
     figures = ["pelvis error rms [mrad]", "ZMP deviation rms [mm]"]
     assert labels == [label for label in figures for _ in PLAYED]  # one below the other
     plt.close(kept[0])
+
+
+def test_actions_that_were_cut_at_their_bounds_are_said() -> None:
+    """Catches a policy that is judged by commands which it did not get."""
+    quick = {"kind": "sine", "duration_s": 0.5, "onset_s": 0.5, "amplitude": 0.1}
+    cells = [Condition(policy={"name": name}, reference=quick) for name in ("input", "zero")]
+    kept, cut = map(evaluate, cells)
+    assert bound_notes([kept, cut]) == []
+    cut.episodes[0]["clipped_share"] = 0.25
+    assert bound_notes([kept, cut]) == [
+        "Actions were cut at their bounds in 1 of 2 cells: in up to 25 % of the control steps of"
+        " zero in nominal, sine."
+    ]

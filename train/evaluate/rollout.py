@@ -202,8 +202,9 @@ def _require_options(spec: PolicySpec, function: Callable[..., Any], options: An
 
 def _not_a_policy(spec: PolicySpec, problem: str) -> ConfigurationError:
     return ConfigurationError(
-        f"policy {spec.name!r}: {problem}; it has to be a function or class that takes the"
-        " environment and returns an object with predict()"
+        f"policy {spec.name!r}: {problem}; give a baseline, such as input, or"
+        ' "FILE.py:function" or "module:function", a function or class that takes the environment'
+        " and returns an object with predict()"
     )
 
 

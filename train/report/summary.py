@@ -38,7 +38,7 @@ def print_summary(evaluations: Sequence[Evaluation], console: Console) -> None:
     if not has_room(table, console):
         table = summary_table(evaluations, columns, intervals=False)
     print_table(table, console, "summary.md")
-    for note in failure_notes(evaluations):
+    for note in [*failure_notes(evaluations), *bound_notes(evaluations)]:
         console.print(note, markup=False)
 
 
@@ -113,6 +113,18 @@ def failure_notes(evaluations: Sequence[Evaluation]) -> list[str]:
     return notes
 
 
+def bound_notes(evaluations: Sequence[Evaluation]) -> list[str]:
+    """A sentence where actions were cut at their bounds, which scores alone do not show."""
+    shares = [e.values("clipped_share").max(initial=0.0) for e in evaluations]
+    cut = sum(share > 0.0 for share in shares)
+    if not cut:
+        return []
+    worst = evaluations[int(np.argmax(shares))].condition
+    where = f"{worst.policy.title} in {worst.scenario}, {worst.reference_name}"
+    share = f"{100.0 * max(shares):.3g} % of the control steps of {where}"
+    return [f"Actions were cut at their bounds in {cut} of {len(shares)} cells: in up to {share}."]
+
+
 def write_episodes(evaluations: Sequence[Evaluation], path: Path) -> Path:
     """One row per episode; columns are names with units."""
     return write_records(list(chain(*(own.episodes for own in evaluations))), path)
@@ -141,5 +153,6 @@ def _parts(evaluations: Sequence[Evaluation]) -> list[str]:
     for title, columns in known.splits.items():
         table = summary_table(evaluations, columns, worst=True)
         parts += [f"{title}:", to_markdown(table)]
-    notes = failure_notes(evaluations)
-    return [*parts, "Where all episodes failed:", bullets(notes)] if notes else parts
+    if notes := failure_notes(evaluations):
+        parts += ["Where all episodes failed:", bullets(notes)]
+    return [*parts, *bound_notes(evaluations)]

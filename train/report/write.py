@@ -20,6 +20,7 @@ from train.report.page import TEXTS, Page
 from train.report.report_text import Results, capital, facts, sentences
 from train.report.score_tables import learning_table, robots_table, scores_table
 from train.report.specs import page_chart
+from train.report.summary import bound_notes
 from train.report.table_formats import Table, load_template
 
 _LONG = 40
@@ -74,7 +75,8 @@ def _page(results: Results) -> Page:
     page = Page(f"Comparison: {results.name}", under)
     page.section("What was compared", *sentences("headline", results))
     page.add("definitions", facts(results))
-    page.add("bullets", sentences("in_short", results), "In short")
+    in_short = [*sentences("in_short", results), *bound_notes(results.evaluations)]
+    page.add("bullets", in_short, "In short")
     if results.standings:
         add_leaderboard(page, results.standings)
     if results.maps:
