@@ -233,13 +233,18 @@ class ByRobot:
     def __init__(self, rows: pd.DataFrame) -> None:
         self._groups: Any = rows.groupby(["cell", "member", "robot"])
         index = self._groups.size().index
-        cells, members, robots = (index.get_level_values(i).to_numpy() for i in range(3))
+        cells, members = (index.get_level_values(i).to_numpy() for i in range(2))
+        robots = index.codes[2]
+        num_robots = len(index.levels[2])
         self._seeds = {member: row for row, member in enumerate(rows["member"].unique())}
         row_of = np.array([self._seeds[member] for member in members])
         self._places: list[tuple[Any, Any, Any]] = []
         for cell in rows["cell"].unique():
             own = np.flatnonzero(cells == cell)
-            column_of = np.unique(robots[own], return_inverse=True)[1]
+            # by name, or where the cell lacks some as they come: intervals draw robots by number
+            column_of, found = pd.factorize(robots[own])
+            if len(found) == num_robots:
+                column_of = robots[own]
             self._places.append((own, row_of[own], column_of))
 
     def figures(
