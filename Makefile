@@ -14,6 +14,8 @@ endef
 export WRONG_PYTHON
 
 .DEFAULT_GOAL := help
+# tests start hundreds of processes: without bytecode on the disk each would compile all that it imports
+unexport PYTHONDONTWRITEBYTECODE
 .PHONY: help demo test test-all test-lerobot lint format typecheck bench residuals docs release-check clean
 
 help: ## Show this text

@@ -16,6 +16,7 @@ import json
 import sys
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -148,9 +149,12 @@ def fingerprint(case: Case) -> Fingerprint:
     """Play a case."""
     digest = hashlib.sha256()
     levels = dict[str, float]()
+    name_of = cache(str)  # of a type, which NumPy makes anew each time
     for number, step in enumerate(_rollout(case)):
         for key, value in _flat(step):
-            digest.update(f"{number}.{key}:{value.dtype}{value.shape}".encode() + value.tobytes())
+            digest.update(
+                f"{number}.{key}:{name_of(value.dtype)}{value.shape}".encode() + value.tobytes()
+            )
             if key in ("observation", "reward", "zmp_deviation", "link_error") or key.startswith(
                 "episode_metrics."
             ):

@@ -12,9 +12,11 @@ def play_to_the_end(env: Any, policy: Any, seed: int = 0) -> dict[str, Any]:
     observation, info = env.reset(seed=seed)
     state = None
     start = np.array(True)
-    while "episode_metrics" not in info:
+    is_over = False
+    while not is_over:
         action, state = policy.predict(observation, state, start)
-        observation, *_, info = env.step(action)
+        observation, _, terminated, truncated, info = env.step(action)
+        is_over = terminated or truncated
         start = np.array(False)
     assert info["termination"] == ""
     return info

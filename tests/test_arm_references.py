@@ -251,12 +251,15 @@ def errors_at_poses(
         timestep_s=0.001,
     )
     player = baselines.make(policy, env)
-    observation, info = env.reset(seed=0)
+    observation, _ = env.reset(seed=0)
+    info = {}
     state = None
     start = np.ones(worlds, dtype=np.bool_)
-    while "episode_metrics" not in info:
+    is_over = False
+    while not is_over:
         action, state = player.predict(observation, state, start)
-        observation, *_, info = env.step(action)
+        observation, _, terminated, truncated, info = env.step(action)
+        is_over = (terminated | truncated).any()
         start = np.zeros(worlds, dtype=np.bool_)
     metrics = info["episode_metrics"]
     return {

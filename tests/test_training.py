@@ -56,7 +56,7 @@ SMALL: dict[str, Any] = {
     "evaluate_every": 96,
     "checkpoint_every": 64,
     "evaluation_episodes": 1,
-    "settings": {"decision_period": 100, "history": 1},
+    "settings": {"decision_period": 50, "history": 1},
 }
 PPO = {"algorithm_options": {"n_steps": 8, "batch_size": 16, "n_epochs": 2}, "anneal": True}
 SAC = {

@@ -2,6 +2,7 @@
 physics on the same plants. The first test on a device compiles kernels."""
 
 import copy
+import importlib
 import pickle
 import sys
 import warnings
@@ -20,7 +21,6 @@ from elastic_env.core.signals import Array
 from elastic_env.joint.make_elastic import transform_hinges
 from elastic_env.joint.small_servos import small_servo
 from elastic_env.world.physics import ManyWorlds, Simulation
-from elastic_env.world.warp_physics import WarpWorlds, for_warp
 from train.commands.speed import Speed, measure
 
 TESTBED = "elastic_env/Testbed-v0"
@@ -40,6 +40,11 @@ BOXES = "".join(
 )
 
 
+def backend() -> Any:
+    """Its module, which takes long to import, where it is needed."""
+    return importlib.import_module("elastic_env.world.warp_physics")
+
+
 def servo(kp: float = 4e3, ki: float = 0.0, imax: float = 0.0, slewmax: float = 0.0) -> Any:
     """A link on a PID servo that gravity pulls down."""
     text = SERVO.format(kp=kp, ki=ki, imax=imax, slewmax=slewmax)
@@ -51,10 +56,10 @@ def plant_of_testbed() -> mujoco.MjModel:
     return gymnasium.make(TESTBED, scenario="backlash").unwrapped.task.model  # pyright: ignore[reportAttributeAccessIssue]
 
 
-def both(number: int = 3) -> tuple[WarpWorlds, ManyWorlds]:
+def both(number: int = 3) -> tuple[Any, ManyWorlds]:
     """Worlds of the testbed on Warp and on threads, in the same states."""
     plant = plant_of_testbed()
-    pair = (WarpWorlds(plant, number, DEVICE), ManyWorlds(plant, number, 1))
+    pair = (backend().WarpWorlds(plant, number, DEVICE), ManyWorlds(plant, number, 1))
     for worlds in pair:
         worlds.bind("xpos")
         worlds.qpos[:] = 0.2 * np.arange(1, number + 1)[:, None]
@@ -92,7 +97,7 @@ def test_the_motor_in_place_of_a_pid_moves_the_link_the_same(ki: float, aim: flo
     """Catches a gain in a wrong slot, the back-EMF left in the torque, and a torque beyond the
     servo's; both models run on MuJoCo."""
     ends = []
-    for model in (servo(ki=ki), for_warp(servo(ki=ki))):
+    for model in (servo(ki=ki), backend().for_warp(servo(ki=ki))):
         data = mujoco.MjData(model)
         data.ctrl[:] = aim
         mujoco.mj_step(model, data, 400)
@@ -106,7 +111,7 @@ def test_the_integral_of_the_motor_stops_at_its_limit() -> None:
     aim = 0.5
     imax = 4e-4
     largest = []
-    for model in (servo(ki=3e4, imax=imax), for_warp(servo(ki=3e4, imax=imax))):
+    for model in (servo(ki=3e4, imax=imax), backend().for_warp(servo(ki=3e4, imax=imax))):
         data = mujoco.MjData(model)
         data.ctrl[:] = aim
         acts = []
@@ -123,12 +128,14 @@ def test_servos_that_are_motors_stay_and_the_given_model_too() -> None:
     joint = {"STS3215": small_servo("STS3215")}
     model = transform_hinges(mujoco.MjSpec.from_string(LINK), joint).compile()
     assert model.actuator_gaintype.tolist() == [int(mujoco.mjtGain.mjGAIN_DCMOTOR)]
-    np.testing.assert_array_equal(for_warp(model).actuator_gainprm, model.actuator_gainprm)
+    np.testing.assert_array_equal(
+        backend().for_warp(model).actuator_gainprm, model.actuator_gainprm
+    )
     own = servo(ki=3e4)
-    for_warp(own)
+    backend().for_warp(own)
     assert own.actuator_gaintype[0] == mujoco.mjtGain.mjGAIN_PID
     with pytest.raises(ConfigurationError, match="slewmax = 0, got 2 rad/s"):
-        for_warp(servo(slewmax=2.0))
+        backend().for_warp(servo(slewmax=2.0))
 
 
 @pytest.mark.parametrize(
@@ -249,7 +256,7 @@ def test_a_world_with_too_many_contacts_says_so_once() -> None:
     model = mujoco.MjModel.from_xml_string(
         f'<mujoco><worldbody><geom type="plane" size="9 9 1"/>{BOXES}</worldbody></mujoco>'
     )
-    worlds: Simulation = WarpWorlds(model, 1, DEVICE)
+    worlds: Simulation = backend().WarpWorlds(model, 1, DEVICE)
     with pytest.warns(UserWarning, match="more than 16 contacts"):
         worlds.advance(2)
     with warnings.catch_warnings():
@@ -281,7 +288,7 @@ def test_the_command_that_measures_a_gpu_steps_its_worlds_on_warp() -> None:
     options = {"backend": "warp", "device": DEVICE, "others": False, "ppo": False}
     config = Speed(env="testbed", num_envs=[2], steps=2, rounds=1, **options)
     loop = config.vector_loop(2, "input", residual=False)
-    assert isinstance(loop.env.unwrapped.simulation, WarpWorlds)
+    assert isinstance(loop.env.unwrapped.simulation, backend().WarpWorlds)
     found = measure(config, lambda share: None)
     assert [one["contender"] for one in found][:2] == ["vector env on warp", "raw mj_step"]
     assert min(one["steps_per_s"] for one in found) > 0.0

@@ -11,7 +11,6 @@ from typing import Annotated, Any, Literal, TypeAlias
 
 import numpy as np
 from pydantic import Field
-from scipy.interpolate import CubicSpline
 
 from elastic_env.core.config import LARGEST_SEED, Locator, quantity
 from elastic_env.core.csv_table import read_table
@@ -282,6 +281,8 @@ class Csv(RepeatableReference):
 
     def joint_plan(self, workspace: Workspace, period_s: float) -> Plan:
         """A plan of all joints, (T, n)."""
+        from scipy.interpolate import CubicSpline  # loads long, and few need it
+
         names, rows = _table(Path(self.file), workspace.joints)
         times = rows[:, 0] - rows[0, 0]
         angles = np.tile(workspace.home, (len(rows), 1))

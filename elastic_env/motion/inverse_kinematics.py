@@ -1,10 +1,9 @@
 """Joint angles whose end effector follows a path, by Newton's method from point to point."""
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
-from scipy.interpolate import CubicSpline
-from scipy.spatial.transform import Rotation
 
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
@@ -21,10 +20,8 @@ _FOR_ORIENTATION = 6
 """Joints that a robot needs to keep the orientation of its tool."""
 
 
-def joint_path(
-    tool: EndEffector, home: Array, place: Callable[[Array], Array], end: float
-) -> CubicSpline:
-    """Joint angles along a path of the end effector, from (...) to (..., n) [rad].
+def joint_path(tool: EndEffector, home: Array, place: Callable[[Array], Array], end: float) -> Any:
+    """Spline of joint angles along a path of the end effector, from (...) to (..., n) [rad].
 
     Args:
         tool: The end effector.
@@ -35,6 +32,9 @@ def joint_path(
     Raises:
         ConfigurationError: The path leaves the workspace, or leads through a singular posture.
     """
+    # here: most programs need no spline, and it loads for a quarter of a second
+    from scipy.interpolate import CubicSpline
+
     s = np.linspace(0.0, end, int(np.ceil(_POINTS * end)) + 1)
     start, R = tool.pose(home)
     angles = [home]
@@ -52,6 +52,8 @@ def joint_path(
 
 def _solved(tool: EndEffector, q: Array, place: Array, R_wanted: Array) -> Array | None:
     """Angles near q that reach a place; six joints or more keep the orientation. None for none."""
+    from scipy.spatial.transform import Rotation
+
     keeps = len(q) >= _FOR_ORIENTATION
     for _ in range(_MOST_STEPS):
         position, R = tool.pose(q)

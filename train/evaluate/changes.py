@@ -26,6 +26,7 @@ from train.evaluate.statistics import (
     interquartile_mean,
 )
 from train.evaluate.table import (
+    ByRobot,
     EpisodeTable,
     Groups,
     Scope,
@@ -33,7 +34,6 @@ from train.evaluate.table import (
     failures,
     means_of_cells,
     pair,
-    per_robot,
 )
 
 CEILING = "ceiling on the training condition"
@@ -289,8 +289,9 @@ def change_of(table: EpisodeTable, scope: Scope, base: str, column: Column) -> C
     parts = [table.of(base, there).assign(cell=cell) for there, cell in beside]
     theirs = pd.concat(parts)
     both = pair(own, theirs, column.metric)
-    mine = per_robot(both, "mine")
-    base_values = per_robot(both, "base")
+    robot_by_robot = ByRobot(both)
+    mine = robot_by_robot.figures("mine")
+    base_values = robot_by_robot.figures("base")
     robots = [values.shape[1] for values in mine]
     once = [np.ones((1, number)) for number in robots]
     means = means_of_cells(mine, once)[:, 0].T
@@ -301,7 +302,7 @@ def change_of(table: EpisodeTable, scope: Scope, base: str, column: Column) -> C
         return change(*sides).T
 
     won, played = (
-        [np.nan_to_num(values) for values in per_robot(both, "won", statistic)]
+        [np.nan_to_num(values) for values in robot_by_robot.figures("won", statistic)]
         for statistic in ("sum", "count")
     )
     falls, episodes = failures(own)

@@ -231,23 +231,56 @@ def per_seed(rows: pd.DataFrame, metric: str) -> Array:
     return np.array([[found.get((m, c), np.nan) for c in cells] for m in members])
 
 
-def per_robot(
-    rows: pd.DataFrame, metric: str, statistic: Literal["mean", "sum", "count"] = "mean"
-) -> list[Array]:
+class ByRobot:
+    """Episodes by cell, training seed and robot, grouped once for all figures.
+
+    Args:
+        rows: With `member`, `cell`, `robot` and metrics.
+    """
+
+    def __init__(self, rows: pd.DataFrame) -> None:
+        self._groups: Any = rows.groupby(["cell", "member", "robot"])
+        index = self._groups.size().index
+        cells, members = (index.get_level_values(i).to_numpy() for i in range(2))
+        robots = index.codes[2]
+        num_robots = len(index.levels[2])
+        self._seeds = {member: row for row, member in enumerate(rows["member"].unique())}
+        row_of = np.array([self._seeds[member] for member in members])
+        self._places: list[tuple[Any, Any, Any]] = []
+        for cell in rows["cell"].unique():
+            own = np.flatnonzero(cells == cell)
+            # by name, or where the cell lacks some as they come: intervals draw robots by number
+            column_of, found = pd.factorize(robots[own])
+            if len(found) == num_robots:
+                column_of = robots[own]
+            self._places.append((own, row_of[own], column_of))
+
+    def figures(
+        self, metric: str, statistic: Literal["mean", "sum", "count"] = "mean"
+    ) -> list[Array]:
+        """A statistic over the episodes of each robot, (seeds, robots) for every cell.
+
+        Args:
+            metric: Its name.
+            statistic: nan without an episode; a mean also without a figure.
+        """
+        values = self._groups[metric].agg(statistic).to_numpy(dtype=np.float64)
+        found = []
+        for own, rows, columns in self._places:
+            table = np.full((len(self._seeds), columns.max() + 1), np.nan)
+            table[rows, columns] = values[own]
+            found.append(table)
+        return found
+
+
+def per_robot(rows: pd.DataFrame, metric: str) -> list[Array]:
     """Means over the episodes of each robot, (seeds, robots) for every cell; nan without a figure.
 
     Args:
         rows: With `member`, `cell`, `robot` and the metric.
         metric: Its name.
-        statistic: Over the episodes of a robot.
     """
-    members = rows["member"].unique()
-    grouped: Any = rows.groupby(["cell", "member", "robot"])[metric]
-    found = grouped.agg(statistic)
-    return [
-        found[cell].unstack().reindex(members).to_numpy(dtype=np.float64)
-        for cell in rows["cell"].unique()
-    ]
+    return ByRobot(rows).figures(metric)
 
 
 def by_episode(rows: pd.DataFrame) -> pd.DataFrame:

@@ -248,10 +248,15 @@ def intervals(mask: Array, time: Array) -> list[tuple[float, float]]:
 
 def quantiles(values: Array) -> tuple[Array, Array, Array]:
     """Least, median and most over the first axis, nan where there is nothing."""
+    shares = [0.0, 0.5, 1.0]
+    has_gap = np.isnan(values).any(axis=0)
+    found = np.empty((len(shares), *has_gap.shape))
+    found[:, ~has_gap] = np.quantile(values[:, ~has_gap], shares, axis=0)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # columns of nothing but nan
-        low, middle, high = np.nanquantile(values, [0.0, 0.5, 1.0], axis=0)
-    return low, middle, high
+        # column by column: a hundred times slower
+        found[:, has_gap] = np.nanquantile(values[:, has_gap], shares, axis=0)
+    return found[0], found[1], found[2]
 
 
 def median(cell: Evaluations, column: Column) -> Estimate:

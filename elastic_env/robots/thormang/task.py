@@ -65,6 +65,7 @@ positions are in the plan's world frame, x forward at the start, y to the left:
 | `episode_metrics` | | at the end of the episode: its figures, whose names end with their unit; ZMP where loaded |
 """  # noqa: E501
 
+import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -90,6 +91,7 @@ from elastic_env.robots.thormang.config import (
     placed_robot,
     require_stable_walker,
     robot_bank,
+    undrawn_model,
 )
 from elastic_env.robots.thormang.model import SIDES, biped
 from elastic_env.world import control_kernels as kernels
@@ -133,7 +135,7 @@ class _Kind:
             plan = walk_plan.with_torque(plan, body, period_s)
         joints = config.true_joints
         model = WalkerModel(joints, body.rigid, period_s, biped=body, plan=plan)
-        return _Kind(config, bank, config.true_model(), model)
+        return _Kind(config, bank, copy.copy(undrawn_model(config)), model)  # pyright: ignore[reportArgumentType]
 
     @property
     def encoder_counts(self) -> int | None:
