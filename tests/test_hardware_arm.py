@@ -95,7 +95,7 @@ def emulated(**changes: Any) -> EmulatedArm:
     return EmulatedArm(**values | changes)
 
 
-def begun(virtual: VirtualArm, commands: Any, settings: ArmSettings = SETTINGS) -> live.Arm:
+def begun(virtual: live.ArmBus, commands: Any, settings: ArmSettings = SETTINGS) -> live.Arm:
     placed = settings.servos(NAMES)
     ranges = placed.servo_ranges(LOWEST, HIGHEST, settings.limits)
     arm = live.Arm(virtual, settings, placed, commands, ranges)
@@ -912,6 +912,17 @@ def test_a_virtual_bus_may_keep_the_pace_of_somebody_who_sends_targets() -> None
     bus.sleep(0.05)
     assert time.monotonic() - begin_s >= 0.05
     assert bus.now_s > 1.0
+
+
+@pytest.mark.parametrize("rate_hz", [50.0, 200.0])
+def test_an_arm_runs_at_both_ends_of_its_range_of_rates(rate_hz: float) -> None:
+    """Catches a period of 20 ms that is taken for a longer wait than the 20 ms that are allowed, by
+    the last bit of a clock."""
+    bus = VirtualBus(EmulatorConfig(model_number=777, ids=tuple(range(1, 7)), arm=emulated()))
+    arm = begun(bus, Plain(), SETTINGS.replace(rate_hz=rate_hz))
+    play(arm, Poses(drawn(5), 1.0), 300)
+    assert arm.counts.cycles == 300
+    assert arm.counts.late == 0
 
 
 def test_poses_of_a_log_are_approached_from_both_sides(tmp_path: Path) -> None:

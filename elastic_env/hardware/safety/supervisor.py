@@ -183,9 +183,9 @@ class Supervisor:
         """
         guard = self._require_motion()
         now = self._clock.monotonic()
-        wait_s = at - now
-        if exceeds(wait_s, LONGEST_WAIT_S):
-            asked = f"asked for {wait_s:.3f} s"
+        # rounded as the caller's sum is: a difference of the two can be above a wait that is not
+        if exceeds(at, now + LONGEST_WAIT_S):
+            asked = f"asked for {at - now:.3f} s"
             raise FaultError(f"a cycle may wait {LONGEST_WAIT_S} s, {asked}")
         is_held = guard.is_holding
         elapsed_s = min(now - self._commanded_s, LONGEST_WAIT_S)
