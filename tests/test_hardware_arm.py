@@ -263,6 +263,40 @@ def test_a_wrong_zero_shows_in_the_loads() -> None:
     assert "look at zero_rad" in said[1]
 
 
+def test_an_arm_that_fell_on_its_stops_passes_its_check() -> None:
+    """Catches a second command that refuses an arm which lies where the first one let it down: its
+    shoulder rests on a stop, beyond its range."""
+    config = EmulatorConfig(model_number=777, ids=tuple(range(1, 7)), arm=emulated(home={}))
+    bus = VirtualBus(config)
+    begun(bus, Plain()).close()
+    bus.sleep(3.0)
+    arm = begun(bus, compensator())
+    assert arm.start[1] > HIGHEST[1]
+    text = io.StringIO()
+    command._check_joints(arm, KnownArm(OPTIONS, JOINTS), PlainConsole(file=text, width=120))
+    follows = re.search(r"shoulder_lift\W+(\d+) %", text.getvalue())
+    assert follows is not None
+    assert int(follows[1]) > 60
+    assert "look at zero_rad" not in text.getvalue()
+
+
+def test_a_move_away_from_a_stop_is_told_with_its_direction() -> None:
+    """Catches a joint that is moved into its stop, or is said to go the other way."""
+    home = HOME.copy()
+    home[3] = HIGHEST[3] - 0.05
+    virtual = VirtualArm(emulated(home=dict(zip(NAMES, home.tolist(), strict=True))))
+    arm = begun(virtual, compensator())
+    assert arm.way_off_stops(2, 0.08) == 0.0
+    assert arm.way_off_stops(3, 0.08) == pytest.approx(-0.11, abs=1e-3)
+    weighed = live.weigh(arm, 3, 0.08)
+    assert weighed.first == pytest.approx(-0.19, abs=1e-3)
+    assert 0.5 < weighed.moved < 1.1
+    assert np.array(virtual.goals)[:, 3].max() <= HIGHEST[3] - 0.05 + 1e-3
+    virtual.bus.write_register(4, "torque_limit", 5)
+    with pytest.raises(HardwareError, match=r"about \+1.5 rad.*at \+1.60. rad, near an end of its"):
+        live.weigh(arm, 3, 0.08)
+
+
 def test_a_blocked_joint_is_named() -> None:
     """Catches a check that passes where nothing moves."""
     virtual = VirtualArm(emulated())

@@ -88,7 +88,7 @@ class OnArm(Model):
     check: bool = True
     """Move every joint a little first, to check its sign and its load."""
     nudge_rad: float = quantity("rad", 0.08, ge=0.02, le=0.2)
-    """How far, to either side [rad]."""
+    """How far, to either side; from a stop that is near, away by up to three times that [rad]."""
     dry_run: bool = False
     """Play against an emulated arm, in its own time, and tell the true error of its tip."""
     yes: bool = False
@@ -434,7 +434,7 @@ def _check_joints(arm: Arm, known: KnownArm, console: Console) -> None:
         weighed.append(weigh(arm, joint, known.options.nudge_rad))
         weighed_torque = abs(float(known.links.gravity_torque(arm.start)[joint]))
         if weighed_torque < _TOLD_NM:
-            _ask(arm, known, joint)
+            _ask(arm, known, joint, weighed[-1].first)
     arm.hold()  # while tables are drawn
     require_signs(known.servos, weighed, known.links.gravity_torque, known.joint_settings)
     rows = []
@@ -505,11 +505,10 @@ def require_signs(
         )
 
 
-def _ask(arm: Arm, known: KnownArm, joint: int) -> None:
-    """Ask whether a joint turned as the model does, where somebody is there to see it."""
+def _ask(arm: Arm, known: KnownArm, joint: int, way: float) -> None:
+    """Ask whether a joint first turned by a way as the model does, if somebody can see it."""
     if known.options.yes or known.options.dry_run or not sys.stdin.isatty():
         return
-    way = known.options.nudge_rad
     moved = 1e3 * way * known.tool.jacobian(arm.start[None])[0][0, :, joint]
     name = known.joints[joint]
     x, y, z = moved
@@ -528,9 +527,10 @@ def _ask(arm: Arm, known: KnownArm, joint: int) -> None:
 
 def _question(known: KnownArm) -> str:
     options = known.options
-    nudges = f"move each joint by ±{options.nudge_rad:g} rad, then " if options.check else ""
+    nudges = f"move each joint by ±{options.nudge_rad:g} rad, away from a stop, then "
     return (
-        f"The {len(known.joints)} servos at {known.settings.port} will {nudges}follow the targets"
+        f"The {len(known.joints)} servos at {known.settings.port} will"
+        f" {nudges if options.check else ''}follow the targets"
         f" with up to {known.settings.speed_rad_s:g} rad/s. Is the way free, and the power switch"
         " in reach?"
     )
