@@ -10,6 +10,7 @@ import signal
 import socket
 import subprocess
 import sys
+import textwrap
 import time
 from pathlib import Path
 from types import SimpleNamespace
@@ -246,14 +247,27 @@ def test_loads_tell_which_sign_is_wrong(seed: int, turned: int | None) -> None:
         assert found == turned
 
 
-def test_a_wrong_zero_shows_in_the_loads() -> None:
-    """Catches a zero that is off by a quarter turn without a word, and a right one with one."""
+IDENTIFIED = """stiffness: .inf
+coulomb_friction: 7.5e-20
+load_friction: 0.357
+rotor_inertia: 0.0243
+viscous_friction: 0.132
+servo: {position_gain: 11.95, velocity_gain: 0.53}"""
+"""What elastic identify finds of the emulated servos: dry friction is lost in its interval."""
+
+
+@pytest.mark.parametrize("own", ["", IDENTIFIED], ids=["typical", "identified"])
+def test_a_wrong_zero_shows_in_the_loads(own: str, tmp_path: Path) -> None:
+    """Catches a zero that is off by a quarter turn without a word, and a right one with one, also
+    where the file of joints says that there is no friction."""
     said = []
+    joints_file = tmp_path / "joints.yaml"
+    joints_file.write_text("'*':\n" + textwrap.indent(own, "  ") if own else JOINTS.read_text())
     for zero in (0.0, 1.4):
         zeros = (0.0, zero, 0.0, 0.0, 0.0, 0.0)
         virtual = VirtualArm(emulated(zero_rad=zeros))
         joints = dict(SETTINGS.joints)
-        known = KnownArm(OPTIONS, JOINTS)
+        known = KnownArm(OPTIONS, joints_file)
         arm = begun(virtual, compensator(), SETTINGS.replace(joints=joints))
         text = io.StringIO()
         command._check_joints(arm, known, PlainConsole(file=text, width=120))

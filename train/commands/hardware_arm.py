@@ -63,8 +63,10 @@ _FAR_GAIN = 1.4
 """A gain that is so many times another one is worth a word."""
 _OFF = 0.2
 """Share by which the load of a servo may differ from that of the model, beside friction."""
+_COUNTS_PER_TURN = 4096
+"""Of servos whose encoder nobody has said."""
 _TOLD_NM = 0.05
-"""Load by the model from which it tells the sign of a joint [N·m]."""
+"""Load by the model from which it tells the sign of a joint; less may be no load [N·m]."""
 _LOGGED = ("target", "desired", "command", "theta", "link", "torque", "temperature")
 _UNITS = {"torque": "N·m", "temperature": "°C"}
 _MOST_ROWS = 200_000
@@ -444,7 +446,7 @@ def _check_joints(arm: Arm, known: KnownArm, console: Console) -> None:
         gain = known.joint_settings[name].servo.sagging_gain(name)
         is_far = max(own.gain / gain, gain / own.gain) > _FAR_GAIN if own.gain > 0.0 else False
         remark = "" if abs(load) >= _TOLD_NM else "light"
-        if abs(own.torque - load) > _hidden(known.joint_settings[name], load) + _OFF * abs(load):
+        if abs(own.torque - load) > _explained(known.joint_settings[name], load, gain):
             remark = "load"
         if is_far:
             remark = "k_p"
@@ -470,7 +472,18 @@ def _check_joints(arm: Arm, known: KnownArm, console: Console) -> None:
 
 def _hidden(joint: JointSettings, load: float) -> float:
     """Torque of a load that friction may hide [N·m]."""
-    return (joint.coulomb_friction or 0.0) + joint.load_friction * abs(load)
+    at_rest = (joint.coulomb_friction or 0.0) + joint.static_friction
+    return at_rest + joint.load_friction * abs(load)
+
+
+def _explained(joint: JointSettings, load: float, gain: float) -> float:
+    """How far a right servo may seem to hold another torque than a load [N·m].
+
+    Friction hides some, the masses are not exact, and a servo measures in counts of its encoder.
+    """
+    count_rad = 2.0 * math.pi / (joint.encoder_counts_per_turn or _COUNTS_PER_TURN)
+    resolution = gain * count_rad if math.isfinite(gain) else 0.0
+    return _hidden(joint, load) + _OFF * abs(load) + max(resolution, _TOLD_NM)
 
 
 def require_signs(
