@@ -159,10 +159,11 @@ class Arm:
         self._bus = bus
         self._compensator = compensator
         self._ranges = ranges
+        self._lowest, self._highest = np.sort(servos.joint_angle(ranges.T), axis=0)
         self._pace = realtime.Pace(self.period_s, bus.clock)
         self._temperature = np.full(n, np.nan)
         self.start: Array = np.zeros(n)
-        """Where the arm stood when its torque went on [rad]."""
+        """Where the arm stood when its torque went on, within the joints' ranges [rad]."""
         self._command = self.start
         self.follower = self._follower(self.start)
 
@@ -174,7 +175,8 @@ class Arm:
         """
         with self._named():
             stands = self._bus.enable(self.settings.limits, self._ranges)
-        self.start = self.servos.joint_angle(stands)
+        # weight presses a joint that rests on a stop beyond its range, which no command may be
+        self.start = np.clip(self.servos.joint_angle(stands), self._lowest, self._highest)
         self.follower = self._follower(self.start)
         self._command = self.start
         self._begin_s = self._bus.clock.monotonic()
@@ -256,7 +258,8 @@ class Arm:
         Returns:
             The way [rad]; 0 where it stands far enough from both ends.
         """
-        lowest, highest = np.sort(self.servos.joint_angle(self._ranges.T)[:, joint])
+        lowest = self._lowest[joint]
+        highest = self._highest[joint]
         room = min(2.0 * way_rad, 0.5 * (highest - lowest))
         stands = self.start[joint]
         return float(np.clip(stands, lowest + room, highest - room) - stands)
