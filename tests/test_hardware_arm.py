@@ -923,6 +923,28 @@ def test_limits_of_a_mounting_are_those_of_an_arm_where_it_names_none() -> None:
     assert settings.limits == ARM_LIMITS.replace(patience_cycles=7)
 
 
+def test_a_patient_command_bears_twice_as_many_missing_replies(tmp_path: Path) -> None:
+    """Catches an arm on an emulator that only a mounting can make patient, a limit of the mounting
+    that gets lost, and an error that names the option to whom has given it."""
+    mounting = tmp_path / "mounting.yaml"
+    mounting.write_text(f"{SOUND}\nlimits: {{slew_rad_s: 1.5}}\n")
+    said = []
+    for patient in (False, True):
+        known = KnownArm(OPTIONS.replace(mounting=mounting, patient=patient), JOINTS)
+        bus = VirtualBus(EmulatorConfig(model_number=777, ids=tuple(range(1, 7)), arm=emulated()))
+        arm = begun(bus, Plain(), known.settings)
+        assert known.settings.limits.slew_rad_s == 1.5
+        arm.cycle(HOME)
+        bus.emulator.set_faults({"lost": 1.0})
+        with pytest.raises(FaultError) as caught:
+            play(arm, Poses(drawn(5), 1.0), 100)
+        said.append(str(caught.value))
+    assert "in 5 cycles in a row" in said[0]
+    assert "for an emulator: --patient" in said[0]
+    assert "in 10 cycles in a row" in said[1]
+    assert "--patient" not in said[1]
+
+
 TURNED = (1, 1, -1, 1, 1, 1)
 
 

@@ -44,6 +44,7 @@ from elastic_env.hardware.live.target_sources import Poses, Socket, Stream, Targ
 from elastic_env.hardware.safety import realtime
 from elastic_env.hardware.safety.checks import check_bus
 from elastic_env.hardware.safety.supervised_bus import SupervisedBus
+from elastic_env.hardware.settings import PATIENT_LIMITS
 from elastic_env.joint.joint_settings import JointSettings, read_joints
 from elastic_env.joint.model_file import compiled_model
 from elastic_env.joint.small_servos import SMALL_SERVOS
@@ -95,6 +96,9 @@ class OnArm(Model):
     """Play against an emulated arm, in its own time, and tell the true error of its tip."""
     yes: bool = False
     """Begin to move without asking."""
+    patient: bool = False
+    """Bear ten missing replies in a row: for emulators, whose pseudo-terminals stall where the
+    computer is busy."""
     output: Path | None = None
     """Folder for logs and configuration, new or empty; default runs/hardware, numbered if taken."""
 
@@ -133,6 +137,9 @@ class KnownArm:
                 raise ConfigurationError(problem)
             given = {"port": "emulated"}
         self.settings = load_yaml(options.mounting, ArmSettings, given)
+        if options.patient:
+            limits = self.settings.limits.replace(**PATIENT_LIMITS)
+            self.settings = self.settings.replace(limits=limits)
         require_known_servos(self.settings, self.model)
         self.mapping: dict[str, Any] = (
             _typical(self.settings) if joints is None else dict(read_mapping(joints))

@@ -105,8 +105,9 @@ class Supervisor:
 
     def _stop_if_hanging(self) -> None:
         if self._guard is not None and self._patience_s() == 0.0:
-            hang_ms = 1e3 * self._guard.limits.hang_s
-            self._stop(f"no command for {hang_ms:.0f} ms: the program hangs")
+            limits = self._guard.limits
+            hint = limits.patience_hint("hang_s")
+            self._stop(f"no command for {1e3 * limits.hang_s:.0f} ms: the program hangs{hint}")
 
     def answer(self, request: dict[str, Any]) -> dict[str, Any]:
         """Do what is asked for; what came of it, or why nothing did."""
