@@ -10,6 +10,7 @@ import signal
 import socket
 import subprocess
 import sys
+import textwrap
 import time
 from pathlib import Path
 from types import SimpleNamespace
@@ -95,7 +96,7 @@ def emulated(**changes: Any) -> EmulatedArm:
     return EmulatedArm(**values | changes)
 
 
-def begun(virtual: VirtualArm, commands: Any, settings: ArmSettings = SETTINGS) -> live.Arm:
+def begun(virtual: live.ArmBus, commands: Any, settings: ArmSettings = SETTINGS) -> live.Arm:
     placed = settings.servos(NAMES)
     ranges = placed.servo_ranges(LOWEST, HIGHEST, settings.limits)
     arm = live.Arm(virtual, settings, placed, commands, ranges)
@@ -246,14 +247,27 @@ def test_loads_tell_which_sign_is_wrong(seed: int, turned: int | None) -> None:
         assert found == turned
 
 
-def test_a_wrong_zero_shows_in_the_loads() -> None:
-    """Catches a zero that is off by a quarter turn without a word, and a right one with one."""
+IDENTIFIED = """stiffness: .inf
+coulomb_friction: 7.5e-20
+load_friction: 0.357
+rotor_inertia: 0.0243
+viscous_friction: 0.132
+servo: {position_gain: 11.95, velocity_gain: 0.53}"""
+"""What elastic identify finds of the emulated servos: dry friction is lost in its interval."""
+
+
+@pytest.mark.parametrize("own", ["", IDENTIFIED], ids=["typical", "identified"])
+def test_a_wrong_zero_shows_in_the_loads(own: str, tmp_path: Path) -> None:
+    """Catches a zero that is off by a quarter turn without a word, and a right one with one, also
+    where the file of joints says that there is no friction."""
     said = []
+    joints_file = tmp_path / "joints.yaml"
+    joints_file.write_text("'*':\n" + textwrap.indent(own, "  ") if own else JOINTS.read_text())
     for zero in (0.0, 1.4):
         zeros = (0.0, zero, 0.0, 0.0, 0.0, 0.0)
         virtual = VirtualArm(emulated(zero_rad=zeros))
         joints = dict(SETTINGS.joints)
-        known = KnownArm(OPTIONS, JOINTS)
+        known = KnownArm(OPTIONS, joints_file)
         arm = begun(virtual, compensator(), SETTINGS.replace(joints=joints))
         text = io.StringIO()
         command._check_joints(arm, known, PlainConsole(file=text, width=120))
@@ -261,6 +275,42 @@ def test_a_wrong_zero_shows_in_the_loads() -> None:
     assert "zero_rad" not in said[0]
     assert "light: its load does not tell the sign" in said[0]
     assert "look at zero_rad" in said[1]
+
+
+def test_an_arm_that_fell_on_its_stops_passes_its_check() -> None:
+    """Catches a second command that refuses an arm which lies where the first one let it down: its
+    shoulder rests on a stop, beyond its range."""
+    config = EmulatorConfig(model_number=777, ids=tuple(range(1, 7)), arm=emulated(home={}))
+    bus = VirtualBus(config)
+    begun(bus, Plain()).close()
+    bus.sleep(3.0)
+    assert bus.links[1] > HIGHEST[1]
+    arm = begun(bus, compensator())
+    assert arm.start[1] == pytest.approx(HIGHEST[1])
+    text = io.StringIO()
+    command._check_joints(arm, KnownArm(OPTIONS, JOINTS), PlainConsole(file=text, width=120))
+    follows = re.search(r"shoulder_lift\W+(\d+) %", text.getvalue())
+    assert follows is not None
+    assert int(follows[1]) > 60
+    assert "look at zero_rad" not in text.getvalue()
+    assert arm.counts.limited <= 1  # the first, onto the range
+
+
+def test_a_move_away_from_a_stop_is_told_with_its_direction() -> None:
+    """Catches a joint that is moved into its stop, or is said to go the other way."""
+    home = HOME.copy()
+    home[3] = HIGHEST[3] - 0.05
+    virtual = VirtualArm(emulated(home=dict(zip(NAMES, home.tolist(), strict=True))))
+    arm = begun(virtual, compensator())
+    assert arm.way_off_stops(2, 0.08) == 0.0
+    assert arm.way_off_stops(3, 0.08) == pytest.approx(-0.11, abs=1e-3)
+    weighed = live.weigh(arm, 3, 0.08)
+    assert weighed.first == pytest.approx(-0.19, abs=1e-3)
+    assert 0.5 < weighed.moved < 1.1
+    assert np.array(virtual.goals)[:, 3].max() <= HIGHEST[3] - 0.05 + 1e-3
+    virtual.bus.write_register(4, "torque_limit", 5)
+    with pytest.raises(HardwareError, match=r"about \+1.5 rad.*at \+1.60. rad, near an end of its"):
+        live.weigh(arm, 3, 0.08)
 
 
 def test_a_blocked_joint_is_named() -> None:
@@ -873,6 +923,28 @@ def test_limits_of_a_mounting_are_those_of_an_arm_where_it_names_none() -> None:
     assert settings.limits == ARM_LIMITS.replace(patience_cycles=7)
 
 
+def test_a_patient_command_bears_twice_as_many_missing_replies(tmp_path: Path) -> None:
+    """Catches an arm on an emulator that only a mounting can make patient, a limit of the mounting
+    that gets lost, and an error that names the option to whom has given it."""
+    mounting = tmp_path / "mounting.yaml"
+    mounting.write_text(f"{SOUND}\nlimits: {{slew_rad_s: 1.5}}\n")
+    said = []
+    for patient in (False, True):
+        known = KnownArm(OPTIONS.replace(mounting=mounting, patient=patient), JOINTS)
+        bus = VirtualBus(EmulatorConfig(model_number=777, ids=tuple(range(1, 7)), arm=emulated()))
+        arm = begun(bus, Plain(), known.settings)
+        assert known.settings.limits.slew_rad_s == 1.5
+        arm.cycle(HOME)
+        bus.emulator.set_faults({"lost": 1.0})
+        with pytest.raises(FaultError) as caught:
+            play(arm, Poses(drawn(5), 1.0), 100)
+        said.append(str(caught.value))
+    assert "in 5 cycles in a row" in said[0]
+    assert "for an emulator: --patient" in said[0]
+    assert "in 10 cycles in a row" in said[1]
+    assert "--patient" not in said[1]
+
+
 TURNED = (1, 1, -1, 1, 1, 1)
 
 
@@ -912,6 +984,17 @@ def test_a_virtual_bus_may_keep_the_pace_of_somebody_who_sends_targets() -> None
     bus.sleep(0.05)
     assert time.monotonic() - begin_s >= 0.05
     assert bus.now_s > 1.0
+
+
+@pytest.mark.parametrize("rate_hz", [50.0, 200.0])
+def test_an_arm_runs_at_both_ends_of_its_range_of_rates(rate_hz: float) -> None:
+    """Catches a period of 20 ms that is taken for a longer wait than the 20 ms that are allowed, by
+    the last bit of a clock."""
+    bus = VirtualBus(EmulatorConfig(model_number=777, ids=tuple(range(1, 7)), arm=emulated()))
+    arm = begun(bus, Plain(), SETTINGS.replace(rate_hz=rate_hz))
+    play(arm, Poses(drawn(5), 1.0), 300)
+    assert arm.counts.cycles == 300
+    assert arm.counts.late == 0
 
 
 def test_poses_of_a_log_are_approached_from_both_sides(tmp_path: Path) -> None:

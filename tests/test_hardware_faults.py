@@ -293,6 +293,7 @@ def test_the_limit_on_silence_is_the_one_that_was_given(
         assert bus._answer_s == supervised_bus._ANSWER_S
         bus.enable(SafetyLimits(hang_s=hang_s))
         assert bus._answer_s == max(hang_s, 0.02)
+        assert ("--patient" in bus._hint) == (hang_s < 0.09)
 
 
 def test_the_watchdog_is_set_where_there_is_one() -> None:

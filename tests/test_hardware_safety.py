@@ -379,7 +379,8 @@ def test_a_supervisor_that_hangs_is_ended_and_torque_switched_off(
     awake.start()
     try:
         with pytest.raises(
-            FaultError, match=r"did not answer within .* ms and was ended; torque is off"
+            FaultError,
+            match=r"did not answer within .* ms and was ended; torque is off; end what else keeps",
         ):
             cycle(supervised, [0.0, 0.0])
     finally:

@@ -8,6 +8,8 @@ from elastic_env.core.config import Model, quantity
 from elastic_env.hardware.buses.packets import LARGEST_ID, RANGE_OF_RATES
 from elastic_env.hardware.buses.servo_models import LARGEST_TORQUE_NM
 
+PATIENT_LIMITS = {"patience_cycles": 10, "hang_s": 0.09}
+"""The most patient limits there are, for emulators: a busy computer delays pseudo-terminals."""
 _TURN = 2.0 * math.pi
 _LEAST_RANGE_RAD = 0.01
 
@@ -46,6 +48,18 @@ class SafetyLimits(Model):
             needed = f"below highest_rad, by at least {_LEAST_RANGE_RAD} rad"
             given = f"{self.lowest_rad} and {self.highest_rad}"
             raise ValueError(f"lowest_rad must be {needed}, got {given}")
+
+    def patience_hint(self, name: str) -> str:
+        """Words for an error that a more patient limit would have avoided.
+
+        Args:
+            name: The limit, one of `PATIENT_LIMITS`.
+
+        Returns:
+            The option that raises it, "" where it is as patient as can be.
+        """
+        is_most = getattr(self, name) >= PATIENT_LIMITS[name]
+        return "" if is_most else "; for an emulator: --patient"
 
 
 class HardwareSettings(Model):

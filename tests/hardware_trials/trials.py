@@ -32,11 +32,10 @@ from elastic_env.hardware.safety.realtime import (
     sleep_until,
 )
 from elastic_env.hardware.safety.supervised_bus import SupervisedBus
-from elastic_env.hardware.settings import SafetyLimits
+from elastic_env.hardware.settings import PATIENT_LIMITS, SafetyLimits
 from elastic_env.robots.testbed.config import TestbedConfig
 from tests.emulators import wait_until_rest
 from tests.hardware_trials.wave import PERIOD_S, goal
-from train.commands.options import PATIENT_LIMITS
 
 _USB_LATENCY = Faults(latency_s=1e-3)
 _TORQUE_OFF_S = 0.1

@@ -281,7 +281,9 @@ class Emulate(Model):
                     " --yes --patient"
                 )
             else:
-                console.print(f"or: elastic hardware compensate --port {emulator.port} ...")
+                console.print(
+                    f"or: elastic hardware compensate --port {emulator.port} --patient ..."
+                )
             console.print("Ctrl-C ends it.")
             if self.fault:
                 time.sleep(self.fault_after_s)

@@ -44,6 +44,7 @@ from elastic_env.hardware.live.target_sources import Poses, Socket, Stream, Targ
 from elastic_env.hardware.safety import realtime
 from elastic_env.hardware.safety.checks import check_bus
 from elastic_env.hardware.safety.supervised_bus import SupervisedBus
+from elastic_env.hardware.settings import PATIENT_LIMITS
 from elastic_env.joint.joint_settings import JointSettings, read_joints
 from elastic_env.joint.model_file import compiled_model
 from elastic_env.joint.small_servos import SMALL_SERVOS
@@ -63,8 +64,10 @@ _FAR_GAIN = 1.4
 """A gain that is so many times another one is worth a word."""
 _OFF = 0.2
 """Share by which the load of a servo may differ from that of the model, beside friction."""
+_COUNTS_PER_TURN = 4096
+"""Of servos whose encoder nobody has said."""
 _TOLD_NM = 0.05
-"""Load by the model from which it tells the sign of a joint [N·m]."""
+"""Load by the model from which it tells the sign of a joint; less may be no load [N·m]."""
 _LOGGED = ("target", "desired", "command", "theta", "link", "torque", "temperature")
 _UNITS = {"torque": "N·m", "temperature": "°C"}
 _MOST_ROWS = 200_000
@@ -88,11 +91,14 @@ class OnArm(Model):
     check: bool = True
     """Move every joint a little first, to check its sign and its load."""
     nudge_rad: float = quantity("rad", 0.08, ge=0.02, le=0.2)
-    """How far, to either side [rad]."""
+    """How far, to either side; from a stop that is near, away by up to three times that [rad]."""
     dry_run: bool = False
     """Play against an emulated arm, in its own time, and tell the true error of its tip."""
     yes: bool = False
     """Begin to move without asking."""
+    patient: bool = False
+    """Bear ten missing replies in a row: for emulators, whose pseudo-terminals stall where the
+    computer is busy."""
     output: Path | None = None
     """Folder for logs and configuration, new or empty; default runs/hardware, numbered if taken."""
 
@@ -131,6 +137,9 @@ class KnownArm:
                 raise ConfigurationError(problem)
             given = {"port": "emulated"}
         self.settings = load_yaml(options.mounting, ArmSettings, given)
+        if options.patient:
+            limits = self.settings.limits.replace(**PATIENT_LIMITS)
+            self.settings = self.settings.replace(limits=limits)
         require_known_servos(self.settings, self.model)
         self.mapping: dict[str, Any] = (
             _typical(self.settings) if joints is None else dict(read_mapping(joints))
@@ -434,7 +443,7 @@ def _check_joints(arm: Arm, known: KnownArm, console: Console) -> None:
         weighed.append(weigh(arm, joint, known.options.nudge_rad))
         weighed_torque = abs(float(known.links.gravity_torque(arm.start)[joint]))
         if weighed_torque < _TOLD_NM:
-            _ask(arm, known, joint)
+            _ask(arm, known, joint, weighed[-1].first)
     arm.hold()  # while tables are drawn
     require_signs(known.servos, weighed, known.links.gravity_torque, known.joint_settings)
     rows = []
@@ -444,7 +453,7 @@ def _check_joints(arm: Arm, known: KnownArm, console: Console) -> None:
         gain = known.joint_settings[name].servo.sagging_gain(name)
         is_far = max(own.gain / gain, gain / own.gain) > _FAR_GAIN if own.gain > 0.0 else False
         remark = "" if abs(load) >= _TOLD_NM else "light"
-        if abs(own.torque - load) > _hidden(known.joint_settings[name], load) + _OFF * abs(load):
+        if abs(own.torque - load) > _explained(known.joint_settings[name], load, gain):
             remark = "load"
         if is_far:
             remark = "k_p"
@@ -470,7 +479,18 @@ def _check_joints(arm: Arm, known: KnownArm, console: Console) -> None:
 
 def _hidden(joint: JointSettings, load: float) -> float:
     """Torque of a load that friction may hide [N·m]."""
-    return (joint.coulomb_friction or 0.0) + joint.load_friction * abs(load)
+    at_rest = (joint.coulomb_friction or 0.0) + joint.static_friction
+    return at_rest + joint.load_friction * abs(load)
+
+
+def _explained(joint: JointSettings, load: float, gain: float) -> float:
+    """How far a right servo may seem to hold another torque than a load [N·m].
+
+    Friction hides some, the masses are not exact, and a servo measures in counts of its encoder.
+    """
+    count_rad = 2.0 * math.pi / (joint.encoder_counts_per_turn or _COUNTS_PER_TURN)
+    resolution = gain * count_rad if math.isfinite(gain) else 0.0
+    return _hidden(joint, load) + _OFF * abs(load) + max(resolution, _TOLD_NM)
 
 
 def require_signs(
@@ -505,11 +525,10 @@ def require_signs(
         )
 
 
-def _ask(arm: Arm, known: KnownArm, joint: int) -> None:
-    """Ask whether a joint turned as the model does, where somebody is there to see it."""
+def _ask(arm: Arm, known: KnownArm, joint: int, way: float) -> None:
+    """Ask whether a joint first turned by a way as the model does, if somebody can see it."""
     if known.options.yes or known.options.dry_run or not sys.stdin.isatty():
         return
-    way = known.options.nudge_rad
     moved = 1e3 * way * known.tool.jacobian(arm.start[None])[0][0, :, joint]
     name = known.joints[joint]
     x, y, z = moved
@@ -528,9 +547,10 @@ def _ask(arm: Arm, known: KnownArm, joint: int) -> None:
 
 def _question(known: KnownArm) -> str:
     options = known.options
-    nudges = f"move each joint by ±{options.nudge_rad:g} rad, then " if options.check else ""
+    nudges = f"move each joint by ±{options.nudge_rad:g} rad, away from a stop, then "
     return (
-        f"The {len(known.joints)} servos at {known.settings.port} will {nudges}follow the targets"
+        f"The {len(known.joints)} servos at {known.settings.port} will"
+        f" {nudges if options.check else ''}follow the targets"
         f" with up to {known.settings.speed_rad_s:g} rad/s. Is the way free, and the power switch"
         " in reach?"
     )

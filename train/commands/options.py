@@ -14,7 +14,7 @@ from elastic_env.core.config import Locator, Model, load_yaml
 from elastic_env.core.config_problems import ModelError, ParameterPath
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.yaml_text import parse_yaml
-from elastic_env.hardware.settings import HardwareSettings
+from elastic_env.hardware.settings import PATIENT_LIMITS, HardwareSettings
 from elastic_env.robots.testbed.model import Pendulum
 from train.evaluate.conditions import GivenReference
 from train.evaluate.environments import environment
@@ -65,8 +65,6 @@ StiffnessOrFile = Annotated[Locator | float | None, BeforeValidator(_read_stiffn
 
 
 _PATIENT_IMU_S = 0.2
-PATIENT_LIMITS = {"patience_cycles": 10, "hang_s": 0.09}
-"""The most patient limits there are, for emulators: a busy computer delays pseudo-terminals."""
 
 
 class Mounting(HardwareSettings):

@@ -159,10 +159,11 @@ class Arm:
         self._bus = bus
         self._compensator = compensator
         self._ranges = ranges
+        self._lowest, self._highest = np.sort(servos.joint_angle(ranges.T), axis=0)
         self._pace = realtime.Pace(self.period_s, bus.clock)
         self._temperature = np.full(n, np.nan)
         self.start: Array = np.zeros(n)
-        """Where the arm stood when its torque went on [rad]."""
+        """Where the arm stood when its torque went on, within the joints' ranges [rad]."""
         self._command = self.start
         self.follower = self._follower(self.start)
 
@@ -174,7 +175,8 @@ class Arm:
         """
         with self._named():
             stands = self._bus.enable(self.settings.limits, self._ranges)
-        self.start = self.servos.joint_angle(stands)
+        # weight presses a joint that rests on a stop beyond its range, which no command may be
+        self.start = np.clip(self.servos.joint_angle(stands), self._lowest, self._highest)
         self.follower = self._follower(self.start)
         self._command = self.start
         self._begin_s = self._bus.clock.monotonic()
@@ -246,6 +248,22 @@ class Arm:
         torque = np.nanmean([state.torque for state in last], axis=0)
         return np.array([goal[joint], theta[joint], torque[joint]]), theta
 
+    def way_off_stops(self, joint: int, way_rad: float) -> float:
+        """How far a joint must go from where it stands for a move to both sides to meet no stop.
+
+        Args:
+            joint: Its number.
+            way_rad: To either side; as far as that it keeps off the ends of its range [rad].
+
+        Returns:
+            The way [rad]; 0 where it stands far enough from both ends.
+        """
+        lowest = self._lowest[joint]
+        highest = self._highest[joint]
+        room = min(2.0 * way_rad, 0.5 * (highest - lowest))
+        stands = self.start[joint]
+        return float(np.clip(stands, lowest + room, highest - room) - stands)
+
     def _follower(self, q: Array) -> Follower:
         return Follower(q, self.settings.speed_rad_s, self.settings.acceleration_rad_s2)
 
@@ -308,12 +326,14 @@ class Weighed:
     """A joint that was moved a little to both sides, and rested there.
 
     Attributes:
+        first: Where it went first, from where it stood [rad].
         moved: Share of the way that it moved [1].
         torque: Load of its servo, mean of both sides [N·m].
         gain: That load over how far the servo gave way, k_p [N·m/rad]; nan where that is little.
         theta: Encoders of all joints, mean of both sides, (n,) [rad].
     """
 
+    first: float
     moved: float
     torque: float
     gain: float
@@ -321,9 +341,9 @@ class Weighed:
 
 
 def weigh(arm: Arm, joint: int, way_rad: float) -> Weighed:
-    """Move a joint a little to both sides.
+    """Move a joint a little to both sides, away from a stop that is near.
 
-    Friction holds it back on either side, so that the mean tells the load.
+    Friction holds it back on either side, so that the mean tells the load. A stop would carry it.
 
     Args:
         arm: Under torque.
@@ -333,20 +353,33 @@ def weigh(arm: Arm, joint: int, way_rad: float) -> Weighed:
     Raises:
         HardwareError: It hardly moves.
     """
-    up, above = arm.nudge(joint, way_rad)
-    down, below = arm.nudge(joint, -way_rad)
+    off_stops = arm.way_off_stops(joint, way_rad)
+    side = -way_rad if off_stops < 0.0 else way_rad
+    far, at_far = arm.nudge(joint, off_stops + side)
+    near, at_near = arm.nudge(joint, off_stops - side)
     arm.nudge(joint, 0.0)
-    moved = float((up - down)[1] / (up - down)[0])
+    moved = float((far - near)[1] / (far - near)[0])
     name = arm.servos.joints[joint]
     if not moved > _MOVED_SHARE:
-        raise HardwareError(
-            f"joint {name!r} follows {100.0 * moved:.0f} % of a move by ±{way_rad:g} rad: it is"
-            " blocked, or its servo has no strength; look at torque limit, gain and supply"
+        stands = arm.start[joint]
+        near_end = (
+            f"; it stands at {stands:+.4g} rad, near an end of its range" if off_stops else ""
         )
-    command, theta, torque = 0.5 * (up + down)
+        raise HardwareError(
+            f"joint {name!r} follows {100.0 * moved:.0f} % of a move by ±{way_rad:g} rad about"
+            f" {stands + off_stops:+.3g} rad: it is blocked, or its servo has no strength; look at"
+            f" torque limit, gain and supply{near_end}"
+        )
+    command, theta, torque = 0.5 * (far + near)
     sag = command - theta
     gain = torque / sag if abs(sag) > _LEAST_SAG_RAD else np.nan
-    return Weighed(moved, float(torque), float(gain), 0.5 * (above + below))
+    return Weighed(
+        first=off_stops + side,
+        moved=moved,
+        torque=float(torque),
+        gain=float(gain),
+        theta=0.5 * (at_far + at_near),
+    )
 
 
 def wrong_sign(

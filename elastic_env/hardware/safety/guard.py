@@ -149,10 +149,11 @@ class Guard:
         self._without_reply = np.where(is_fresh, 0, self._without_reply + 1)
         lost = self._without_reply >= limits.patience_cycles
         if lost.any():
+            hint = limits.patience_hint("patience_cycles")
             return (
                 f"no usable reply from {self._list(lost)} in {limits.patience_cycles} cycles in a "
                 "row; look at cables and power, the adapter's latency timer, and what else keeps "
-                "the computer busy: elastic hardware check"
+                f"the computer busy: elastic hardware check{hint}"
             )
         lowest = self._lowest - limits.margin_rad
         highest = self._highest + limits.margin_rad

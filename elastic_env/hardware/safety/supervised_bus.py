@@ -101,6 +101,8 @@ class SupervisedBus(contextlib.AbstractContextManager["SupervisedBus"]):
         self._is_enabled = False
         self._number = 0
         self._answer_s = _ANSWER_S
+        self._hint = ""
+        """Words for an answer that did not come in motion."""
         # for confirmations and checks: several tries for each servo that does not answer
         self._slow_s = _SLOW_S + _SLOW_PER_SERVO_S * sum(map(len, self._ports.values()))
         self._lock = threading.Lock()
@@ -148,6 +150,7 @@ class SupervisedBus(contextlib.AbstractContextManager["SupervisedBus"]):
         arguments = {"limits": limits.model_dump(), "ranges": ends}
         answer = self._request("enable", self._slow_s, **arguments)
         self._answer_s = max(limits.hang_s, _LEAST_ANSWER_S)
+        self._hint = limits.patience_hint("hang_s") or "; end what else keeps the computer busy"
         return np.array(answer["position"])
 
     def exchange(self, goals: Array, at: float) -> Cycle:
@@ -283,7 +286,8 @@ class SupervisedBus(contextlib.AbstractContextManager["SupervisedBus"]):
             how = f"did not answer within {1e3 * silent_s:.0f} ms and was ended"
         known = (self._baudrate, self.models, self._protocol)
         outcome = emergency_stop(self._ports, *known)
-        return FaultError(f"the supervisor process {how}; {outcome}")
+        hint = "" if silent_s is None else self._hint
+        return FaultError(f"the supervisor process {how}; {outcome}{hint}")
 
 
 def emergency_stop(

@@ -105,8 +105,9 @@ class Supervisor:
 
     def _stop_if_hanging(self) -> None:
         if self._guard is not None and self._patience_s() == 0.0:
-            hang_ms = 1e3 * self._guard.limits.hang_s
-            self._stop(f"no command for {hang_ms:.0f} ms: the program hangs")
+            limits = self._guard.limits
+            hint = limits.patience_hint("hang_s")
+            self._stop(f"no command for {1e3 * limits.hang_s:.0f} ms: the program hangs{hint}")
 
     def answer(self, request: dict[str, Any]) -> dict[str, Any]:
         """Do what is asked for; what came of it, or why nothing did."""
@@ -183,9 +184,9 @@ class Supervisor:
         """
         guard = self._require_motion()
         now = self._clock.monotonic()
-        wait_s = at - now
-        if exceeds(wait_s, LONGEST_WAIT_S):
-            asked = f"asked for {wait_s:.3f} s"
+        # rounded as the caller's sum is: a difference of the two can be above a wait that is not
+        if exceeds(at, now + LONGEST_WAIT_S):
+            asked = f"asked for {at - now:.3f} s"
             raise FaultError(f"a cycle may wait {LONGEST_WAIT_S} s, {asked}")
         is_held = guard.is_holding
         elapsed_s = min(now - self._commanded_s, LONGEST_WAIT_S)
