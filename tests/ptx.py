@@ -69,7 +69,7 @@ def _call_template(self: Any, args: Any, kws: Any) -> Any:
 def _numpy_on_a_device() -> ModuleType:
     found = ModuleType("numpy_on_a_device")
     names = {name: getattr(np, name) for name in ("sin", "fmax", "nan")}
-    own = {"isnan": math.isnan, "isfinite": math.isfinite, "rint": libdevice.rint}
+    own = {"abs": math.fabs, "isnan": math.isnan, "isfinite": math.isfinite, "rint": libdevice.rint}
     vars(found).update(**names, **own, empty=_local_array)
     return found
 

@@ -870,7 +870,7 @@ def score(row: Any, planned: Any, weights: Any, is_failed: bool, terms: Any) -> 
 @compiled
 def tilt_penalty(tilt: Parameter) -> Any:
     """−|tilt| [rad]: linear, so that a large error never stops to matter."""
-    return -abs(tilt)
+    return -np.abs(tilt)
 
 
 @compiled
