@@ -121,9 +121,28 @@ def test_a_printed_text_is_no_markup(text: str) -> None:
     assert shown_by(console, lambda console: console.print(text)) == f"{text}\n"
 
 
+class Screen(io.StringIO):
+    """What a terminal shows."""
+
+    def isatty(self) -> bool:
+        """Lines can be drawn again."""
+        return True
+
+
+def test_a_file_that_asks_for_colours_gets_no_bar_that_is_drawn_again() -> None:
+    """Catches a notebook, whose FORCE_COLOR makes Rich take it for a terminal, with a line for
+    every drawing of a bar."""
+    for file, is_bar in ((Screen(), True), (io.StringIO(), False)):
+        console = PlainConsole(file=file, width=100, force_terminal=True)
+        with show_progress(console, {"filming": 10}) as show:
+            for done in range(11):
+                show(0, done)
+        assert ("\x1b[2K" in file.getvalue()) is is_bar
+
+
 def test_progress_and_warnings_obey_no_text() -> None:
     """Catches the name of a folder in a bar, and that of a joint in a warning."""
-    console = PlainConsole(file=io.StringIO(), width=100, force_terminal=True)
+    console = PlainConsole(file=Screen(), width=100, force_terminal=True)
     with show_progress(console, {f"[/x] {HOSTILE}": 2}) as show:
         show(0, 1, f"[/x] {HOSTILE}")
     written = re.sub(r"\x1b\[[\d;]*[A-Za-ln-z]", "", console.file.getvalue())  # type: ignore[attr-defined]

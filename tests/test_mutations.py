@@ -227,7 +227,8 @@ def test_a_physics_step_that_never_ends_a_control_period_is_refused(timestep_s: 
 def test_a_function_that_makes_no_policy_is_explained(name: str) -> None:
     """Catches a traceback for a function that takes no environment."""
     with pytest.raises(
-        ConfigurationError, match=r'"module:function", a function or class that takes the environment'
+        ConfigurationError,
+        match=r'"module:function", a function or class that takes the environment',
     ):
         make_policy(PolicySpec(name=name), object())
 

@@ -52,7 +52,7 @@ from elastic_env.rigid.rigid_body import RigidBody
 from elastic_env.rigid.tree.end_effector import EndEffector, outermost_body
 from elastic_env.robots.robot.joints import STIFF_OVER_SERVO
 from elastic_env.world.robot_model import joint_ranges
-from train.runs.console import make_table, print_files
+from train.runs.console import can_redraw, make_table, print_files
 from train.runs.folders import run_folder
 
 _SHOWN_S = 0.5
@@ -646,9 +646,10 @@ def live_table(state: ArmState, joints: Sequence[str], arm: Arm, targets: Target
 @contextlib.contextmanager
 def _shown(console: Console) -> Iterator[Callable[[Callable[[], str]], None]]:
     """Shows a text now and then: in place at a terminal, else below the last one."""
-    period_s = _SHOWN_S if console.is_terminal else _PLAIN_SHOWN_S
+    is_redrawn = can_redraw(console)
+    period_s = _SHOWN_S if is_redrawn else _PLAIN_SHOWN_S
     next_s = time.monotonic()
-    live = Live(console=console, auto_refresh=False) if console.is_terminal else None
+    live = Live(console=console, auto_refresh=False) if is_redrawn else None
 
     def show(text: Callable[[], str]) -> None:
         nonlocal next_s

@@ -48,6 +48,15 @@ class PlainConsole(Console):
             yield one if one.control else Segment(visible(one.text), one.style)
 
 
+def can_redraw(console: Console) -> bool:
+    """True where lines can be drawn again.
+
+    A notebook or a CI that asks for colours is a terminal for Rich, and shows each drawing below
+    the last one.
+    """
+    return console.is_terminal and console.file.isatty()
+
+
 _Row = Sequence[str]
 
 

@@ -9,6 +9,8 @@ from contextlib import contextmanager
 from rich import progress
 from rich.console import Console
 
+from train.runs.console import can_redraw
+
 _LEAST_S = 10.0
 """Time between two lines of progress in a log [s]; shorter work says nothing."""
 _ANNOUNCED_S = 3.0
@@ -91,7 +93,7 @@ def show_progress(
     Yields:
         A function that takes the number of a task, how much of it has been done, and a note.
     """
-    if not console.is_terminal:
+    if not can_redraw(console):
         say = plain_progress(console, _LEAST_S, unit)
         done = [0] * len(totals)
 
