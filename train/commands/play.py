@@ -10,7 +10,6 @@ from typing import Any
 
 import gymnasium
 from rich.console import Console
-from rich.progress import track
 
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.errors import (
@@ -23,6 +22,7 @@ from elastic_env.core.errors import (
 from train.commands.options import DEFAULT_SCENARIO, MotionOrDefault, name_options
 from train.evaluate.conditions import Condition, PolicySpec, Seed, cell_of
 from train.evaluate.rollout import control_steps, make_policy, make_vector_env
+from train.runs.progress import Show, show_progress
 
 _FRAMES_PER_S = 25
 _Step = tuple[int, Mapping[str, Any]]
@@ -58,10 +58,16 @@ def play(
         if video is None:
             _window(played, period)
         else:
-            bar = {"total": steps, "console": console, "transient": True}
-            shown = track(played, "filming", **bar)
-            _film(env, shown, period, video)
+            with show_progress(console, {"filming": steps}, transient=True, unit="film") as show:
+                _film(env, _counted(played, show), period, video)
             console.print(f"wrote {video}")
+
+
+def _counted(played: Iterable[Any], show: Show) -> Iterator[Any]:
+    """What is played, with its progress shown."""
+    for number, one in enumerate(played, 1):
+        yield one
+        show(0, number)
 
 
 def steps_within(task: Any, max_s: float | None) -> int:
