@@ -9,7 +9,8 @@ import subprocess
 import sys
 import time
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import metadata
 from io import StringIO
@@ -972,14 +973,15 @@ def test_play_takes_one_step_at_least_and_the_episode_at_most(
     that is none."""
     played = []
 
-    def track(episode: Any, _: str, total: int, **__: Any) -> Any:
-        played.append(total)
-        return episode
+    @contextmanager
+    def progress(_: Console, totals: dict[str, int], **__: Any) -> Iterator[Any]:
+        played.extend(totals.values())
+        yield lambda *_: None
 
     def film(env: Any, episode: Any, *_: Any) -> None:
         played.append(len(list(episode)))
 
-    monkeypatch.setattr("train.commands.play.track", track)
+    monkeypatch.setattr("train.commands.play.show_progress", progress)
     monkeypatch.setattr("train.commands.play._film", film)
     play(condition(), Console(quiet=True), Path("x.gif"), max_s=max_s)
     assert played == [steps, steps]
