@@ -1,10 +1,13 @@
 """The overview of a comparison: bars of every policy, a panel per reference."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import matplotlib.pyplot as plt
+import numpy as np
 import pytest
+from matplotlib.collections import LineCollection
 
 from train.evaluate.conditions import Condition
 from train.evaluate.episodes import evaluate
@@ -54,3 +57,33 @@ def test_actions_that_were_cut_at_their_bounds_are_said() -> None:
         "Actions were cut at their bounds in 1 of 2 cells: in up to 25 % of the control steps of"
         " zero in nominal, sine."
     ]
+
+
+def test_intervals_stand_beside_the_episodes_of_bars(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches an interval of another statistic than the bar's, one in other units, and a legend of
+    what is not drawn."""
+    kept: list[Any] = []
+    monkeypatch.setattr(plots, "save", lambda figure, path: kept.append(figure) or path)
+    quick = {"kind": "multisine", "duration_s": 2.0}
+    several = evaluate(Condition(policy={"name": "input"}, reference=quick, episodes=4))
+    columns = several.condition.environment.judged[:1]
+    metric = columns[0].metric
+    values = np.sort([own[metric] for own in several.episodes])
+    for own, is_drawn in (
+        (several, True),
+        (replace(several, episodes=several.episodes[:1]), False),
+    ):
+        plots.draw_overview([own], columns, tmp_path / "overview.png")
+        figure = kept.pop()
+        axis = figure.axes[0]
+        lines = [part for part in axis.collections if isinstance(part, LineCollection)]
+        assert len(lines) == is_drawn
+        labels = [text.get_text() for text in figure.legends[0].get_texts()]
+        assert ("95 % interval of the median" in labels) is is_drawn
+        if is_drawn:
+            assert axis.patches[0].get_height() == pytest.approx(1e3 * np.median(values))
+            low, high = lines[0].get_segments()[0][:, 1]
+            assert 1e3 * values[0] <= low < 1e3 * np.median(values) < high <= 1e3 * values[-1]
+        plt.close(figure)

@@ -51,10 +51,13 @@ def test_what_is_wrong_with_a_file_is_said(tmp_path: Path) -> None:
     bad = tmp_path / "bad.py"
     good.write_text("def answer(env):\n    return 42\n")
     bad.write_text("raise SystemExit(5)\n")
+    empty = tmp_path / "empty.py"
+    empty.write_text("from pathlib import Path\nNAME = 'x'\n")
     for name, said in (
         (f"{tmp_path / 'none.py'}:f", "there is no file"),
         (f"{bad}:f", "SystemExit: 5"),
         (f"{good}:question", "unknown function or class of .* 'question'; choose one of: answer"),
+        (f"{empty}:f", "has no 'f', and no function or class of its own"),
     ):
         with pytest.raises(ConfigurationError, match=said):
             named_object(name)

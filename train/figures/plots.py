@@ -226,8 +226,9 @@ def draw_overview(evaluations: Evaluations, columns: Sequence[Column], path: Pat
         handles.append(axes[0].scatter([], [], **cross))
     if any(len(evaluation.episodes) > 1 for evaluation in evaluations):
         handles.append(axes[0].scatter([], [], label="episode (bar: median)", **_DOTS))
+    if any(median_of(own, column.metric).has_interval for own in evaluations for column in columns):
         style = {"marker": "|", "lw": 0.0, "ms": 9, "mew": _INTERVAL["lw"], "color": INK}
-        handles += axes[0].plot([], [], label="its 95 % interval", **style)
+        handles += axes[0].plot([], [], label="95 % interval of the median", **style)
     ncols = columns_of(len(handles), max(int(size[0] / 1.7), 2))
     figure.legend(handles=handles, ncols=ncols, loc="outside lower center")
     return save(figure, path)

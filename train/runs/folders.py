@@ -17,6 +17,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any, TextIO
 
+from elastic_env.core.config import read_json
 from elastic_env.core.errors import (
     ConfigurationError,
     ResultsExistError,
@@ -24,6 +25,7 @@ from elastic_env.core.errors import (
     shorten,
 )
 from elastic_env.core.files import leads_out, write_whole
+from elastic_env.core.json_text import LARGEST_JSON
 from elastic_env.core.yaml_text import yaml_of
 
 RUNS = Path("runs")
@@ -69,10 +71,11 @@ def _write_metadata(folder: Path, content: dict[str, Any], results: list[str]) -
 def _recorded_results(folder: Path) -> list[str]:
     """Names of files in a folder, which may come from anybody."""
     try:
-        found = json.loads((folder / _METADATA).read_text(encoding="utf-8"))["results"]
-    except (OSError, ValueError, KeyError, TypeError):
+        found = read_json(folder / _METADATA, LARGEST_JSON, missing=str)
+    except ConfigurationError:
         return []
-    named = found if isinstance(found, list) else []
+    results = found.get("results") if isinstance(found, dict) else None
+    named = results if isinstance(results, list) else []
     present = {file.name for file in folder.iterdir() if file.is_file()}
     return sorted(name for name in present - {CONFIG, _METADATA, _LOCK} if name in named)
 

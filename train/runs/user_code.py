@@ -155,8 +155,13 @@ def named_object(name: str) -> Any:
         ) from error
     if not hasattr(module, attribute):
         _require_unshadowed(module, attribute)
-        callables = inspect.getmembers(module, callable)
-        own = [name for name, found in callables if found.__module__ == module.__name__]
+        functions = inspect.getmembers(module, inspect.isfunction)
+        classes = inspect.getmembers(module, inspect.isclass)
+        known = [*functions, *classes]
+        own = [name for name, found in known if found.__module__ == module.__name__]
+        if not own:
+            problem = f"{shorten(place)} has no {attribute!r}"
+            raise ConfigurationError(f"{problem}, and no function or class of its own")
         raise unknown_name(f"function or class of {shorten(place)}", attribute, own)
     return getattr(module, attribute)
 
