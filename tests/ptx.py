@@ -43,6 +43,9 @@ def ptx_of(kernel: Any, kinds: tuple[Any, ...], using: ModuleType) -> str:
         patch.setattr(dispatcher, "get_current_device", lambda: device)
         patch.setattr(dispatcher.CUDADispatcher, "get_call_template", _call_template)
         patch.setattr(using, "np", _numpy_on_a_device())
+        for name, part in vars(using).copy().items():
+            if hasattr(part, "kernel"):  # CUDA's target looks for Numba's own object
+                patch.setattr(using, name, part.kernel)
         found = compile_cuda(kernel, types.void, kinds, cc=_CAPABILITY)
         place = (code.co_filename, code.co_firstlineno)
         library, _ = found.target_context.prepare_cuda_kernel(

@@ -7,6 +7,7 @@ import importlib
 import importlib.util
 import io
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -39,15 +40,26 @@ KERNELS = (
     "baselines.walking.dcm_observer",
     "baselines.walking.mean_zmp",
     "baselines.walking.foothold",
-    "baselines.walking.foothold",
     "baselines.walking.posture",
-    "baselines.walking.mean_zmp",
-    "baselines.walking.mean_zmp",
     "baselines.walking.zmp_shift",
     "baselines.estimation.bending",
     "baselines.residual.residual_policy",
     "baselines.identification.servo_replay",
 )
+
+
+DECORATORS = ("compiled", "compiled_part", "within_compiled")
+
+
+def decorated(tree: ast.Module, *decorators: str) -> list[ast.FunctionDef]:
+    """Functions with one of these decorators, by default all that Numba compiles."""
+    return [
+        node
+        for node in tree.body
+        if isinstance(node, ast.FunctionDef)
+        and node.decorator_list
+        and ast.unparse(node.decorator_list[0]) in (decorators or DECORATORS)
+    ]
 
 
 @pytest.mark.parametrize("name", KERNELS)
@@ -63,10 +75,7 @@ def test_a_kernel_calls_functions_of_its_own_file_alone(name: str) -> None:
         and str(node.module).startswith(("elastic_env", "baselines", "train"))
         for alias in node.names
     }
-    functions = [f for f in tree.body if isinstance(f, ast.FunctionDef) and f.decorator_list]
-    compiled_ones = [
-        f for f in functions if ast.unparse(f.decorator_list[0]) in ("compiled", "within_compiled")
-    ]
+    compiled_ones = decorated(tree)
     assert compiled_ones
     for function in compiled_ones:
         used = {
@@ -89,6 +98,21 @@ def test_every_compiled_function_is_looked_at() -> None:
     found = {file for file in files if any(sign in file.read_text() for sign in signs)}
     known = {ROOT / f"{name.replace('.', '/')}.py" for name in KERNELS}
     assert found - {ROOT / "elastic_env" / "core" / "compiled.py"} == known
+
+
+def test_the_package_calls_no_part_of_a_kernel_from_python() -> None:
+    """Catches a call that compiles a way in, in every process."""
+    parts: set[str] = set()
+    for name in KERNELS:
+        tree = ast.parse((ROOT / f"{name.replace('.', '/')}.py").read_text())
+        here = {function.name for function in decorated(tree, "compiled_part")}
+        in_python = [node for node in tree.body if node not in decorated(tree)]
+        used = [n for part in in_python for n in ast.walk(part) if isinstance(n, ast.Name)]
+        assert not {node.id for node in used} & here, name
+        parts |= here
+    for package in ("elastic_env", "baselines", "train"):
+        for file in (ROOT / package).rglob("*.py"):
+            assert not set(re.findall(r"\bkernels\.(\w+)\(", file.read_text())) & parts, file
 
 
 def test_where_nothing_can_be_kept_it_works_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -37,7 +37,7 @@ from baselines.compensation.policy import (
     select_rows,
 )
 from baselines.compensation.startup import Ramp
-from elastic_env.core.compiled import compiled
+from elastic_env.core.compiled import compiled, compiled_part
 from elastic_env.core.errors import ConfigurationError, require_known
 from elastic_env.core.signals import Array, IntArray, Parameter
 from elastic_env.joint import elasticity
@@ -421,7 +421,7 @@ def lead_motors(
     return found
 
 
-@compiled
+@compiled_part
 def follow_lag(state: float, target: float, lag_s: float, period_s: float) -> float:
     """State of a first-order lag after one period towards a constant target.
 

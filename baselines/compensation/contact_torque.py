@@ -18,7 +18,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from baselines.compensation.policy import WalkView, record_row, record_rows
-from elastic_env.core.compiled import compiled
+from elastic_env.core.compiled import compiled, compiled_part
 from elastic_env.core.signals import Array
 from elastic_env.motion.walk_plan import WalkPlan
 from elastic_env.rigid.leg_chains import LegTorque
@@ -198,7 +198,7 @@ def planned_loads(observed: Any, contact: Any, feet: Any, level: Any, tilted: An
         fill_gravity(plan, ground.gravity, False, tilted[world])
 
 
-@compiled
+@compiled_part
 def from_middle(plan: Any, stance: Any, share: float, axis: int) -> float:
     """The planned ZMP from the soles' middle weighted by their loads, in the world [m]."""
     left = (1.0 - share) * stance.soles[0, axis]
@@ -206,7 +206,7 @@ def from_middle(plan: Any, stance: Any, share: float, axis: int) -> float:
     return plan.zmp_reference[axis] - middle
 
 
-@compiled
+@compiled_part
 def row_of_plan(observed: Any, period_s: float, periods_ago: float, rows: int) -> int:
     """Row of the plan at the end of the coming control period, or some periods before it."""
     periods = np.rint(observed.clock[0] / period_s)
@@ -235,7 +235,7 @@ def measured_loads(observed: Any, gravity: float, is_level: bool, loads: Any) ->
                 load.wrench[foot, 1, i] = shown.wrench[foot, 1, i]
 
 
-@compiled
+@compiled_part
 def fill_gravity(shown: Any, gravity: float, is_level: bool, load: Any) -> None:
     """Gravity in the frame of a pelvis that is level or tilted."""
     turned = (0.0, 0.0, -gravity)
@@ -246,7 +246,7 @@ def fill_gravity(shown: Any, gravity: float, is_level: bool, load: Any) -> None:
         load.gravity[i] = turned[i]
 
 
-@compiled
+@compiled_part
 def gravity_in_pelvis(roll: float, pitch: float, gravity: float) -> Vector:
     """Gravity in the frame of a tilted pelvis [m/s²]."""
     cosine = math.cos(pitch)
@@ -292,13 +292,13 @@ def shifted_shares(observed: Any, shift: Array, feet: Any, period_s: float, foun
         found[world] = shifted_share(stance.share, across, stance.spacing)
 
 
-@compiled
+@compiled_part
 def shift_across(shift: Array, stance: Any) -> float:
     """The part of a shift in the local frame from the right foot towards the left one [m]."""
     return shift[0] * stance.across[0] + shift[1] * stance.across[1]
 
 
-@compiled
+@compiled_part
 def shifted_share(share: float, shift: float, spacing: float) -> float:
     """Load share of the right foot under a ZMP that is shifted towards the left one.
 

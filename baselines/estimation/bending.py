@@ -22,7 +22,7 @@ import numpy as np
 
 from baselines.compensation.compensators import GravityCompensator
 from baselines.compensation.policy import Records, WalkView
-from elastic_env.core.compiled import compiled, record_type
+from elastic_env.core.compiled import compiled, compiled_part, record_type
 from elastic_env.core.signals import Array, Signal
 from elastic_env.world.robot_model import WalkerModel
 
@@ -155,7 +155,7 @@ def regress(
         found[world, 8] = load / carried_n - 1.0
 
 
-@compiled
+@compiled_part
 def update(x: Array, P: Array, expected: float, seen: float, sigma: float) -> None:
     """Take in a measurement of (expected, 1) · x = seen − expected with a standard deviation."""
     first = P[0] * expected + P[1]

@@ -24,7 +24,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from baselines.identification.servo_log import ServoLog
-from elastic_env.core.compiled import compiled
+from elastic_env.core.compiled import compiled, compiled_part
 from elastic_env.core.signals import Array, BoolArray
 
 PARAMETERS = {
@@ -183,7 +183,7 @@ def _play(
         out[k + 1] = q
 
 
-@compiled
+@compiled_part
 def _acceleration(
     side: float,
     pull: float,

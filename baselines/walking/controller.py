@@ -53,7 +53,7 @@ from baselines.walking.zmp_shift import (
     following_share,
     move_pelvis,
 )
-from elastic_env.core.compiled import compiled, record_type
+from elastic_env.core.compiled import compiled, compiled_part, record_type
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array, IntArray
 from elastic_env.motion.trajectory import STAND_S, minimum_jerk
@@ -327,7 +327,7 @@ def control(
     return is_shifted
 
 
-@compiled
+@compiled_part
 def follow_zmp(center: float, zmp: float, share: float) -> float:
     """The center of mass a period later, under a ZMP shift that stays as it is.
 
@@ -336,7 +336,7 @@ def follow_zmp(center: float, zmp: float, share: float) -> float:
     return center + share * (zmp - center)
 
 
-@compiled
+@compiled_part
 def weigh(controller: Any, shown: Any, last: Any, own: Any) -> None:
     """The weight as the feet show it, filtered; a share of zero keeps it."""
     of_soles = vertical_force(shown, 0) + vertical_force(shown, 1)
@@ -346,13 +346,13 @@ def weigh(controller: Any, shown: Any, last: Any, own: Any) -> None:
         own.weight = last.weight + controller.weight_share * (load - last.weight)
 
 
-@compiled
+@compiled_part
 def vertical_force(shown: Any, foot: int) -> float:
     """Along the normal of a sole, which is nearly vertical [N]."""
     return shown.wrench[foot, 0, 2]
 
 
-@compiled
+@compiled_part
 def balance_feet(
     controller: Any, shown: Any, share: float, change: float, last: Any, own: Any
 ) -> None:
@@ -365,7 +365,7 @@ def balance_feet(
     own.difference = within(difference, controller.force_difference_limit_m)
 
 
-@compiled
+@compiled_part
 def follow_com(
     controller: Any, shown: Any, planned: Any, change: float, last: Any, own: Any
 ) -> None:
@@ -389,7 +389,7 @@ def follow_com(
             own.shift[i] = last.shift[i] + controller.zmp_share * missing
 
 
-@compiled
+@compiled_part
 def offset_leg(
     controller: Any,
     shown: Any,
@@ -435,7 +435,7 @@ def offset_leg(
         out[first + i] = ramp * moved + wound * friction
 
 
-@compiled
+@compiled_part
 def lengthening(
     controller: Any, knee: float, difference: float, sign: float
 ) -> tuple[float, float, float]:
@@ -451,7 +451,7 @@ def lengthening(
     return at_hip, bend, -bend - at_hip
 
 
-@compiled
+@compiled_part
 def within(value: float, limit: float) -> float:
     """A value within ±limit; what is no number stays so."""
     if value > limit:

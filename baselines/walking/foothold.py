@@ -61,7 +61,7 @@ from baselines.compensation.policy import (
     record_rows,
 )
 from baselines.walking.zmp_shift import Stances, move_feet
-from elastic_env.core.compiled import compiled, record_type
+from elastic_env.core.compiled import compiled, compiled_part, record_type
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array, IntArray, Mirrored, SignalGroup
 from elastic_env.motion.walk_plan import derivatives, refine_plan
@@ -361,7 +361,7 @@ def correct_footholds(gains: Any, plan: Any, observed: Any, memory: Any, coming:
             own.offset[foot, i] = share * own.target[foot, i]
 
 
-@compiled
+@compiled_part
 def feel_landing(rules: Any, planned: Any, shown: Any, own: Any) -> None:
     """Add the present error of the feet's distance, where both carry the robot."""
     if 0.25 < shown.load_share < 0.75:
@@ -376,7 +376,7 @@ def feel_landing(rules: Any, planned: Any, shown: Any, own: Any) -> None:
         own.samples += 1.0
 
 
-@compiled
+@compiled_part
 def lift(rules: Any, planned: Any, own: Any, foot: int) -> None:
     """Take the landing of the standing foot into account, as the other one lifts off."""
     standing = 1 - foot
@@ -398,7 +398,7 @@ def lift(rules: Any, planned: Any, own: Any, foot: int) -> None:
         own.total[i] = 0.0
 
 
-@compiled
+@compiled_part
 def aim(rules: Any, planned: Any, own: Any, foot: int) -> None:
     """Offset with which the foot in the air is to land."""
     standing = own.place[1 - foot]
@@ -408,7 +408,7 @@ def aim(rules: Any, planned: Any, own: Any, foot: int) -> None:
         own.target[foot, i] = min(max(wanted, -rules.limit_m), rules.limit_m)
 
 
-@compiled
+@compiled_part
 def turned(x: float, y: float, angle: float) -> tuple[float, float]:
     """A vector turned about the vertical, to the left [rad]."""
     cosine = math.cos(angle)
@@ -416,7 +416,7 @@ def turned(x: float, y: float, angle: float) -> tuple[float, float]:
     return cosine * x - sine * y, sine * x + cosine * y
 
 
-@compiled
+@compiled_part
 def blend(s: float) -> float:
     """Minimum-jerk blend from 0 to 1, s clipped to [0, 1]."""
     s = min(max(s, 0.0), 1.0)

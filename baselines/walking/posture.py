@@ -30,7 +30,7 @@ from typing_extensions import override
 from baselines.compensation import policy as policies
 from baselines.compensation.policy import Records, Step
 from baselines.compensation.startup import Ramp
-from elastic_env.core.compiled import compiled, record_type
+from elastic_env.core.compiled import compiled, compiled_part, record_type
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array
 from elastic_env.motion.trajectory import STAND_S
@@ -193,7 +193,7 @@ def hold_posture(
                     out[world, 6 * leg + 2] += pitch
 
 
-@compiled
+@compiled_part
 def pitch_of_leg(own: Any, right: Any, leg: int, turn: float, last: Any, kept: Any) -> Any:
     """Hip pitch of a leg [rad].
 
@@ -206,7 +206,7 @@ def pitch_of_leg(own: Any, right: Any, leg: int, turn: float, last: Any, kept: A
     return last.kept[leg] + standing * (turn - last.kept[leg])
 
 
-@compiled
+@compiled_part
 def within(value: float, limit: float) -> float:
     """A value within ±limit; what is no number stays so."""
     if value > limit:

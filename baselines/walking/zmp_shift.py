@@ -30,7 +30,7 @@ from scipy import linalg
 
 from baselines.compensation.contact_torque import cosine_and_sine
 from baselines.compensation.policy import record_row, record_rows
-from elastic_env.core.compiled import compiled
+from elastic_env.core.compiled import compiled, compiled_part
 from elastic_env.core.signals import Array
 from elastic_env.rigid.leg_kinematics import LegGeometry, turn
 from elastic_env.world.robot_model import WalkerModel
@@ -173,7 +173,7 @@ def move_feet(legs: Any, stances: Any, steps: Any, shift: Array, out: Array) -> 
                 move_hip(legs[0], stances[steps[row]], side, -own, out[row])
 
 
-@compiled
+@compiled_part
 def move_hip(leg: Any, stance: Any, side: int, shift: Array, out: Array) -> None:
     """Add the offsets of one leg, (12,) [rad], whose hip moves over its foot, (2,) [m]."""
     ankle = stance.ankles[side]
@@ -192,7 +192,7 @@ def move_hip(leg: Any, stance: Any, side: int, shift: Array, out: Array) -> None
         out[6 * side + i] += q[i] - stance.q[side, i]
 
 
-@compiled
+@compiled_part
 def level_leg(legs: Any, x: float, y: float, z: float) -> tuple[float, float, float]:
     """Hip roll, hip pitch and knee of a leg whose sole is parallel to the pelvis [rad].
 

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from elastic_env.core.compiled import compiled, within_compiled
+from elastic_env.core.compiled import compiled, compiled_part, within_compiled
 from elastic_env.core.signals import Array, BoolArray, IntArray, Parameter
 
 FIRST_HALF = 1
@@ -57,7 +57,7 @@ class Step(NamedTuple):
     used: IntArray
 
 
-@compiled
+@compiled_part
 def step_of(joints: Any, worlds: Any, row: int, *constants: Any) -> Step:
     """The step of a row of blocks of joints, (steps, num_worlds, n), and of worlds."""
     return Step(joints[row - 1], joints[row], worlds[row - 1], worlds[row], *constants)
@@ -132,14 +132,14 @@ def command(
     return True
 
 
-@compiled
+@compiled_part
 def coming_motion(step: Step, world: int) -> tuple[int, int]:
     """Which plan the reference at the end of the coming period is of, and which row of it."""
     coming = step.worlds[world].truth.step + 1
     return step.plan[world], min(coming, step.plans.shape[1] - 1)
 
 
-@compiled
+@compiled_part
 def begin_joints(qpos: Array, qvel: Array, step: Step, world: int) -> None:
     """Truth and measurements of joints that have been at rest at the start of an episode."""
     course = step.worlds[world].truth
@@ -159,7 +159,7 @@ def begin_joints(qpos: Array, qvel: Array, step: Step, world: int) -> None:
         joint.shown.encoder_before = joint.shown.encoder
 
 
-@compiled
+@compiled_part
 def sense_joints(
     qpos: Array, qvel: Array, step: Step, control: Control, first: int, stride: int
 ) -> None:
@@ -205,7 +205,7 @@ def show_joints(step: Any, observed: Array) -> None:
         observe_joints(step, world, 1.0, observed[world])
 
 
-@compiled
+@compiled_part
 def read_joint(qpos: Array, qvel: Array, at: Any, joint: Any, count_rad: float) -> None:
     """State of a joint as the physics has it, and the motor's angle by its encoder."""
     truth = joint.truth
@@ -219,7 +219,7 @@ def read_joint(qpos: Array, qvel: Array, at: Any, joint: Any, count_rad: float) 
         joint.shown.encoder = in_whole_counts(angle, count_rad)
 
 
-@compiled
+@compiled_part
 def observe_joints(step: Step, world: int, periods: float, observed: Array) -> None:
     """Fill the joints' columns of an observation, the coming reference among them."""
     rules = step.rules[step.kind[world]]
@@ -343,7 +343,7 @@ def sense_links(
     return is_over
 
 
-@compiled
+@compiled_part
 def show_link(imu_angle: Any, links: Links, step: Step, world: int) -> None:
     """The next sample of the IMU on the only link, see `Links`."""
     quality = links.constants[0]
@@ -467,13 +467,13 @@ def show_walk(step: Any, walker: Any, observed: Array) -> None:
         observe_walk(step, walker, world, observed[world])
 
 
-@compiled
+@compiled_part
 def row_of(plan: Any, step: int) -> Any:
     """Row of the plan at a control step; after the end its last row."""
     return plan[min(step, len(plan) - 1)]
 
 
-@compiled
+@compiled_part
 def sample_of(step: Step, world: int) -> Any:
     """The next sample of a world."""
     used = step.used[world]
@@ -481,7 +481,7 @@ def sample_of(step: Step, world: int) -> Any:
     return step.samples[min(used, len(step.samples) - 1), world]
 
 
-@compiled
+@compiled_part
 def read_body(physics: Physics, walker: Walker, step: Step, world: int) -> None:
     """State of pelvis and feet as the physics has it, force of the ground, and the ZMP.
 
@@ -520,7 +520,7 @@ def read_body(physics: Physics, walker: Walker, step: Step, world: int) -> None:
     row.force[1] = force[1, 2]
 
 
-@compiled
+@compiled_part
 def stand_off(row: Any, planned: Any) -> None:
     """Where the feet stand against the plan; nan where there is no ZMP."""
     drift_of_feet(row.force, row.ankles, planned.ankles, row.drift)
@@ -528,7 +528,7 @@ def stand_off(row: Any, planned: Any) -> None:
         row.drift[0] = row.drift[1] = np.nan
 
 
-@compiled
+@compiled_part
 def attitude_by(up_x: float, up_y: float, up_z: float) -> tuple[float, float, float]:
     """Roll and pitch (of yaw, pitch, roll), and the angle between z axis and vertical [rad].
 
@@ -538,7 +538,7 @@ def attitude_by(up_x: float, up_y: float, up_z: float) -> tuple[float, float, fl
     return math.atan2(up_y, up_z), pitch, math.atan2(math.hypot(up_x, up_y), up_z)
 
 
-@compiled
+@compiled_part
 def watch_swing_foot(row: Any, planned: Any, loaded_n: float) -> None:
     """Since when the swing foot has been on the ground in the second half of its swing."""
     if planned.half_of_swing == FIRST_HALF:
@@ -548,7 +548,7 @@ def watch_swing_foot(row: Any, planned: Any, loaded_n: float) -> None:
         row.contact_since = row.step
 
 
-@compiled
+@compiled_part
 def measure(
     inertial: Any, walker: Walker, step: Step, world: int, noise: Any, imu_is_due: bool
 ) -> None:
@@ -577,7 +577,7 @@ def measure(
         shown.imu_rate[i] = noise.imu_rate[i] * sigma.imu_rate[i] + row.pelvis_rate[i]
 
 
-@compiled
+@compiled_part
 def add_foot_errors(bias: Any, wrench: Array, seconds: float, shown: Array) -> None:
     """Add bias, drift and cross-talk of the feet's sensors, see `elastic_env.world.foot_sensors`.
 
@@ -599,7 +599,7 @@ def add_foot_errors(bias: Any, wrench: Array, seconds: float, shown: Array) -> N
             shown[foot, part, i] += error
 
 
-@compiled
+@compiled_part
 def show_inertial(inertial: Any, walker: Walker, step: Step, world: int) -> bool:
     """Show the state of an inertial IMU, where one is fitted; the result says so.
 
@@ -622,7 +622,7 @@ def show_inertial(inertial: Any, walker: Walker, step: Step, world: int) -> bool
     return True
 
 
-@compiled
+@compiled_part
 def settle_imu(inertial: Any, walker: Any, step: Step, world: int, noise: Any) -> None:
     """Settle an inertial IMU that has been at rest for long, a bias of its gyroscope included."""
     if inertial is None:
@@ -642,7 +642,7 @@ def settle_imu(inertial: Any, walker: Any, step: Step, world: int, noise: Any) -
     settled_vertical(shown.imu_up, force, bias.gyro, sensor.time_constant_s)
 
 
-@compiled
+@compiled_part
 def advance_imu(inertial: Any, walker: Any, step: Step, world: int, noise: Any) -> None:
     """Advance an inertial IMU by a control period.
 
@@ -685,7 +685,7 @@ def advance_imu(inertial: Any, walker: Any, step: Step, world: int, noise: Any) 
     complementary_filter(shown.imu_up, turned, force, gain)
 
 
-@compiled
+@compiled_part
 def specific_force(
     before: Any, row: Any, period_s: float, gravity_m_s2: float, force: Array
 ) -> None:
@@ -704,7 +704,7 @@ def specific_force(
         force[i] = R[0, i] * a + R[1, i] * b + R[2, i] * c
 
 
-@compiled
+@compiled_part
 def rotation_of(quaternion: Array, R: Array) -> None:
     """Rotation matrix of a unit quaternion w, x, y, z: into `R`, (3, 3)."""
     w = quaternion[0]
@@ -731,7 +731,7 @@ def rotations_of(quaternions: Array) -> Array:
     return R
 
 
-@compiled
+@compiled_part
 def rotation_between(before: Array, after: Array, turned: Array) -> None:
     """Rotation vector from one unit quaternion to another: into `turned`, (3,) [rad].
 
@@ -812,7 +812,7 @@ def settled_vertical(up: Array, force: Array, gyro: Array, delay_s: float) -> No
     up[2] = z / size
 
 
-@compiled
+@compiled_part
 def cross(x: float, y: float, z: float, other: Array) -> tuple[float, float, float]:
     """Cross product of (x, y, z) with another vector."""
     a = y * other[2] - z * other[1]
@@ -834,7 +834,7 @@ def shown_angle(
     return angle + drawn_bias + noise + (bias_rad + sine_error_rad * np.sin(angle))
 
 
-@compiled
+@compiled_part
 def end(row: Any, rules: Any, diverged: bool, is_last: bool, ends: BoolArray) -> bool:
     """Say what ends the episode of a world, if anything does; what has diverged has not fallen."""
     is_down = row.pelvis[2] < rules.lowest_pelvis_m or row.tilt > rules.highest_tilt_rad
@@ -847,7 +847,7 @@ def end(row: Any, rules: Any, diverged: bool, is_last: bool, ends: BoolArray) ->
     return is_terminated or is_last
 
 
-@compiled
+@compiled_part
 def score(row: Any, planned: Any, weights: Any, is_failed: bool, terms: Any) -> float:
     """Weighted terms of the reward, and their sum."""
     x = row.zmp[0] - planned.zmp[0]
@@ -867,19 +867,19 @@ def score(row: Any, planned: Any, weights: Any, is_failed: bool, terms: Any) -> 
     return total + (terms.zmp_in_feet + terms.foot_drift)
 
 
-@compiled
+@compiled_part
 def tilt_penalty(tilt: Parameter) -> Any:
     """−|tilt| [rad]: linear, so that a large error never stops to matter."""
     return -np.abs(tilt)
 
 
-@compiled
+@compiled_part
 def distance_penalty(distance: Parameter) -> Any:
     """−distance [m]; none where the feet are not loaded and it is nan."""
     return -np.fmax(distance, 0.0)
 
 
-@compiled
+@compiled_part
 def observe_walk(step: Step, walker: Walker, world: int, observed: Array) -> None:
     """Fill the walker's columns of an observation, beside those of its joints."""
     is_delayed = step.rules[step.kind[world]].is_delayed
@@ -899,7 +899,7 @@ def observe_walk(step: Step, walker: Walker, world: int, observed: Array) -> Non
                 observed[column] = shown.wrench[foot, part, i]
 
 
-@compiled
+@compiled_part
 def rms(values: Array) -> float:
     """Root of the mean square, added in order."""
     total = 0.0
@@ -917,7 +917,7 @@ def rms_of_rows(values: Array) -> Array:
     return found
 
 
-@compiled
+@compiled_part
 def ground_wrench(
     sensors: Array, foot_R: Array, com: Array, weight: Array, force: Array, moment: Array
 ) -> None:
@@ -942,7 +942,7 @@ def ground_wrench(
         moment[foot, 2] -= c[0] * w[1] - c[1] * w[0]
 
 
-@compiled
+@compiled_part
 def moment_point(force: Array, moment: Array, ankle: Array, least_n: float, zmp: Array) -> None:
     r"""ZMP of both feet of one robot on the ground plane z = 0: into `zmp`, (2,) [m].
 
@@ -964,7 +964,7 @@ def moment_point(force: Array, moment: Array, ankle: Array, least_n: float, zmp:
     zmp[1] = about_x / scale
 
 
-@compiled
+@compiled_part
 def drift_of_feet(force: Array, ankle: Array, planned: Array, drift: Array) -> None:
     r"""Displacement of standing feet against the plan, in the ground plane: into `drift`, (2,).
 

@@ -9,7 +9,7 @@ from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
-from elastic_env.core.compiled import compiled
+from elastic_env.core.compiled import compiled, compiled_part
 from elastic_env.core.signals import Array, BoolArray, IntArray, Signals
 from elastic_env.world.rows import WHOLE, record_type
 
@@ -70,7 +70,7 @@ def fold(folds: Any, signals: Array, masks: BoolArray, total: Array, count: IntA
                     count[row, world] += 1
 
 
-@compiled
+@compiled_part
 def joined(statistic: int, before: float, value: float) -> float:
     """A statistic and the next sample; a sample that is nan makes all but the last value nan."""
     if statistic == 0:

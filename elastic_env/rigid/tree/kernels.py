@@ -35,7 +35,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from elastic_env.core.compiled import compiled, record_type
+from elastic_env.core.compiled import compiled, compiled_part, record_type
 from elastic_env.core.signals import Array
 
 Vector: TypeAlias = tuple[float, float, float]
@@ -330,13 +330,13 @@ def tilt_rotations(attitude: Array, R: Array) -> None:
         fill_matrix(R[row], rotation_of(attitude[row, 0], attitude[row, 1]))
 
 
-@compiled
+@compiled_part
 def loads_of(loads: Any, start: int, count: int) -> Any:
     """Loads of a block of rows; one load serves all."""
     return loads[start : start + count] if len(loads) > 1 else loads
 
 
-@compiled
+@compiled_part
 def weigh(links: Any, loads: Any, q: Array) -> bool:
     """All that acts on the links at rest, and whether tips bear loads."""
     turn(links, q)
@@ -350,7 +350,7 @@ def weigh(links: Any, loads: Any, q: Array) -> bool:
     return has_tips
 
 
-@compiled
+@compiled_part
 def lift(links: Any, loads: Any, rows: int) -> None:
     """The vertical u, from the base to the tips."""
     for row in range(rows):
@@ -366,7 +366,7 @@ def lift(links: Any, loads: Any, rows: int) -> None:
             put(link["up"], row, into_link(R, c, s, at(above["up"], row)))
 
 
-@compiled
+@compiled_part
 def begin(links: Any, rows: int, has_wrenches: bool) -> None:
     """Every link carries itself."""
     for i in range(len(links)):
@@ -381,7 +381,7 @@ def begin(links: Any, rows: int, has_wrenches: bool) -> None:
                 put(link["moment"], row, (0.0, 0.0, 0.0))
 
 
-@compiled
+@compiled_part
 def carry(links: Any, rows: int, has_wrenches: bool) -> None:
     """Weights, their first moments l, and forces and moments, from the tips to the base."""
     for i in range(len(links) - 1, 0, -1):
@@ -405,7 +405,7 @@ def carry(links: Any, rows: int, has_wrenches: bool) -> None:
                 put(above["moment"], row, total(at(above["moment"], row), moment))
 
 
-@compiled
+@compiled_part
 def load_tip(link: Any, loads: Any, rows: int) -> None:
     """Add what a tip bears to what its link carries."""
     tip = link["tip"]
@@ -423,7 +423,7 @@ def load_tip(link: Any, loads: Any, rows: int) -> None:
         put(link["moment"], row, scale(-1.0, moment))
 
 
-@compiled
+@compiled_part
 def turn(links: Any, q: Array) -> None:
     """Cosines and sines of the joint angles."""
     for i in range(1, len(links)):
@@ -439,7 +439,7 @@ def turn(links: Any, q: Array) -> None:
             sine[row] = s
 
 
-@compiled
+@compiled_part
 def hold(links: Any, has_wrenches: bool, torque: Array) -> None:
     """Torques of what the links carry."""
     for i in range(1, len(links)):
@@ -452,7 +452,7 @@ def hold(links: Any, has_wrenches: bool, torque: Array) -> None:
             torque[row, column] = needed
 
 
-@compiled
+@compiled_part
 def differentiate(links: Any, has_wrenches: bool, rows: int, gradient: Array) -> None:
     """Gradient of what the links carry, of every joint along all that carry it, (n, n, BLOCK)."""
     for j in range(1, len(links)):
@@ -492,7 +492,7 @@ def differentiate(links: Any, has_wrenches: bool, rows: int, gradient: Array) ->
                     gradient[before, column, row] += moved[2]
 
 
-@compiled
+@compiled_part
 def solve(A: Array, b: Array) -> None:
     """Solve A x = b in place; what is singular gives no finite numbers."""
     n = len(b)
@@ -516,7 +516,7 @@ def solve(A: Array, b: Array) -> None:
         b[i] /= A[i, i]
 
 
-@compiled
+@compiled_part
 def move(links: Any, q_dot: Array, q_ddot: Array) -> None:
     """Rates and accelerations from the base to the tips, and what every link needs for itself."""
     for row in range(len(q_dot)):
@@ -553,13 +553,13 @@ def move(links: Any, q_dot: Array, q_ddot: Array) -> None:
             put(link["moment"], row, total(needed, cross(moment, linear)))
 
 
-@compiled
+@compiled_part
 def acceleration_of(arm: Vector, rate: Vector, angular: Vector) -> Vector:
     """α × r + ω × (ω × r): acceleration of a point of a frame, without that of the origin."""
     return total(cross(angular, arm), cross(rate, cross(rate, arm)))
 
 
-@compiled
+@compiled_part
 def rotation_of(roll: float, pitch: float) -> Matrix:
     """Rotation about x by a roll, then about y by a pitch."""
     sr = math.sin(roll)
@@ -569,7 +569,7 @@ def rotation_of(roll: float, pitch: float) -> Matrix:
     return cp, sp * sr, sp * cr, 0.0, cr, -sr, -sp, cp * sr, cp * cr
 
 
-@compiled
+@compiled_part
 def into_link(R: Matrix, c: float, s: float, v: Vector) -> Vector:
     """A vector of the parent in the frame of a link whose joint has turned."""
     x = R[0] * v[0] + R[3] * v[1] + R[6] * v[2]
@@ -578,13 +578,13 @@ def into_link(R: Matrix, c: float, s: float, v: Vector) -> Vector:
     return c * x + s * y, c * y - s * x, z
 
 
-@compiled
+@compiled_part
 def into_parent(R: Matrix, c: float, s: float, v: Vector) -> Vector:
     """The other way round."""
     return times(R, (c * v[0] - s * v[1], s * v[0] + c * v[1], v[2]))
 
 
-@compiled
+@compiled_part
 def times(A: Matrix, v: Vector) -> Vector:
     """A v."""
     x = A[0] * v[0] + A[1] * v[1] + A[2] * v[2]
@@ -592,7 +592,7 @@ def times(A: Matrix, v: Vector) -> Vector:
     return x, y, A[6] * v[0] + A[7] * v[1] + A[8] * v[2]
 
 
-@compiled
+@compiled_part
 def product(A: Matrix, B: Matrix) -> Matrix:
     """A B."""
     x = times(A, (B[0], B[3], B[6]))
@@ -601,7 +601,7 @@ def product(A: Matrix, B: Matrix) -> Matrix:
     return x[0], y[0], z[0], x[1], y[1], z[1], x[2], y[2], z[2]
 
 
-@compiled
+@compiled_part
 def cross(a: Vector, b: Vector) -> Vector:
     """A × b."""
     x = a[1] * b[2] - a[2] * b[1]
@@ -609,25 +609,25 @@ def cross(a: Vector, b: Vector) -> Vector:
     return x, y, a[0] * b[1] - a[1] * b[0]
 
 
-@compiled
+@compiled_part
 def total(a: Vector, b: Vector) -> Vector:
     """A + b."""
     return a[0] + b[0], a[1] + b[1], a[2] + b[2]
 
 
-@compiled
+@compiled_part
 def scale(factor: float, v: Vector) -> Vector:
     """A multiple of a vector."""
     return factor * v[0], factor * v[1], factor * v[2]
 
 
-@compiled
+@compiled_part
 def vector(v: Array) -> Vector:
     """An array of three numbers as a vector."""
     return v[0], v[1], v[2]
 
 
-@compiled
+@compiled_part
 def matrix(R: Array) -> Matrix:
     """A matrix out of its array, which leaves the compiler sure that nothing changes it."""
     x = R[0, 0], R[0, 1], R[0, 2]
@@ -635,25 +635,25 @@ def matrix(R: Array) -> Matrix:
     return x + y + (R[2, 0], R[2, 1], R[2, 2])
 
 
-@compiled
+@compiled_part
 def at(field: Array, row: int) -> Vector:
     """The vector of a row."""
     return field[0, row], field[1, row], field[2, row]
 
 
-@compiled
+@compiled_part
 def put(field: Array, row: int, v: Vector) -> None:
     """Keep the vector of a row."""
     field[0, row], field[1, row], field[2, row] = v
 
 
-@compiled
+@compiled_part
 def fill(out: Array, v: Vector) -> None:
     """Write a vector into an array of three numbers."""
     out[0], out[1], out[2] = v
 
 
-@compiled
+@compiled_part
 def fill_matrix(out: Array, A: Matrix) -> None:
     """Write a matrix into its array."""
     fill(out[0], (A[0], A[1], A[2]))
