@@ -39,7 +39,7 @@ from baselines.walking.foothold import (
     FootTare,
     FootTareGains,
     RefinedWalk,
-    refined,
+    refine_model,
 )
 from baselines.walking.mean_zmp import StandingEstimate, StandingGains, ZmpOffset, ZmpOffsetGains
 from baselines.walking.phase_table import PhaseFeedforward, load_phase_table
@@ -242,7 +242,7 @@ def _oracle(env: Any, model: RobotModel, options: PolicyOptions) -> Policy:
     true_model = env.unwrapped.truth().model
     if not isinstance(true_model, WalkerModel):
         return Oracle(env, Zero(model), true_model, ramp_s)
-    further = refined(true_model)
+    further = refine_model(true_model)
     options = _with_quick_gains(options)
     inner = _controller(env, further, options)
     policy: Any = Oracle(env, inner, further, ramp_s, friction=False, integral_gain=0.0)
@@ -258,7 +258,7 @@ def _on_refined_walk(build: Builder) -> Builder:
     """With feet that land as planned, along the refined plan, under its full joint torque."""
 
     def built(env: Any, model: WalkerModel, options: PolicyOptions) -> Any:
-        further = refined(model)
+        further = refine_model(model)
         options = _with_quick_gains(options)
         if options.base in (None, "dynamic"):
             options = options.replace(base="dynamic", output=options.output or "taylor")

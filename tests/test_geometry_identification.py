@@ -100,7 +100,7 @@ def test_a_rigid_nominal_arm_is_mujocos(model: mujoco.MjModel, geometry: Geometr
     _, q = draw(0)
     data = mujoco.MjData(model)
     nominal = geometry.nominal_parameters()
-    shown = geometry.measured(nominal, q)
+    shown = geometry.predict_markers(nominal, q)
     moments = geometry.moments(geometry.posture(nominal, q))
     for i, row in enumerate(q):
         data.qpos[:] = row
@@ -118,7 +118,7 @@ def test_derivatives_are_difference_quotients(
     generator, q = draw(1)
     parameters = some_parameters(generator)
     shown, gradient = geometry.gradient(parameters, q, axial)
-    np.testing.assert_array_equal(shown, geometry.measured(parameters, q, axial))
+    np.testing.assert_array_equal(shown, geometry.predict_markers(parameters, q, axial))
     for kind, values in parameters._asdict().items():
         step = {"compliance": 1e-8, "friction": 1e-4}.get(kind, 1e-6)
         for index in np.ndindex(values.shape):
@@ -126,8 +126,10 @@ def test_derivatives_are_difference_quotients(
             less = values.copy()
             more[index] += step
             less[index] -= step
-            change = geometry.measured(parameters._replace(**{kind: more}), q, axial)
-            change = change - geometry.measured(parameters._replace(**{kind: less}), q, axial)
+            change = geometry.predict_markers(parameters._replace(**{kind: more}), q, axial)
+            change = change - geometry.predict_markers(
+                parameters._replace(**{kind: less}), q, axial
+            )
             own = getattr(gradient, kind)[(..., *index)]
             size = np.abs(getattr(gradient, kind)).max()
             np.testing.assert_allclose(own, change / (2.0 * step), atol=1e-7 * size)
@@ -141,8 +143,8 @@ def test_deflection_about_the_axis_is_that_of_the_elastic_joint(geometry: Geomet
     compliance[:, 2] = 1.0 / np.array([400.0, 300.0, 200.0, 100.0])
     soft = nominal._replace(compliance=compliance)
     torque = -geometry.moments(geometry.posture(soft, theta))[..., 2]
-    rigid = geometry.measured(nominal, theta - torque * compliance[:, 2])
-    np.testing.assert_allclose(geometry.measured(soft, theta), rigid, atol=1e-9)
+    rigid = geometry.predict_markers(nominal, theta - torque * compliance[:, 2])
+    np.testing.assert_allclose(geometry.predict_markers(soft, theta), rigid, atol=1e-9)
 
 
 def test_a_joint_that_gravity_overcomes_is_named(geometry: GeometryModel) -> None:
@@ -186,7 +188,11 @@ def test_the_corrected_model_is_the_identified_arm(tree: Tree, geometry: Geometr
     """Catches a correction in the frame of another body."""
     generator, theta = draw(3)
     problem = GeometryProblem(
-        geometry, theta, geometry.measured(geometry.nominal_parameters(), theta), JOINTS, "full"
+        geometry,
+        theta,
+        geometry.predict_markers(geometry.nominal_parameters(), theta),
+        JOINTS,
+        "full",
     )
     x = problem.unknowns.prior * generator.standard_normal(len(problem.unknowns.prior))
     fit = fit_geometry(problem)
@@ -215,7 +221,7 @@ def made_up(
         truth[problem.unknowns.part(kind)] *= 0.1  # what an alignment leaves
     own = problem.unknowns.part("compliance")
     truth[own] = prior[own] * generator.uniform(0.1, 0.6, len(own))
-    shown = arm.measured(problem.parameters(truth), theta, problem.axial)
+    shown = arm.predict_markers(problem.parameters(truth), theta, problem.axial)
     measured = shown + noise_m * generator.standard_normal(blank.shape)
     return GeometryProblem(arm, theta, measured, JOINTS, elastic=JOINTS, **options), truth  # type: ignore[arg-type]
 
@@ -286,7 +292,7 @@ def test_what_poses_do_not_tell_keeps_its_prior_and_is_named(geometry: GeometryM
     """The first joint's height is the tracker's: catches a parameter that runs away."""
     problem, _ = made_up(geometry, 0, count=30, noise_m=5e-4, geometry="dh")
     result = describe_geometry(fit_geometry(problem), None)
-    assert "pan.z length" in result.kept
+    assert "pan.z length" in result.prior_parameters
     height = next(p for p in result.parameters if (p.kind, p.name) == ("length", "pan.z"))
     assert abs(height.value) < 2e-3
 
@@ -415,9 +421,9 @@ def test_the_tracker_is_aligned_before_the_fit(geometry: GeometryModel) -> None:
     turned = geometry.nominal_parameters()._replace(
         rotation=np.array([0.0, 0.0, 3.0]), translation=np.array([1.0, -2.0, 0.5])
     )
-    measured = geometry.measured(turned, theta)
+    measured = geometry.predict_markers(turned, theta)
     own = align_tracker(geometry, theta, measured)
-    shown = own.measured(own.nominal_parameters(), theta)
+    shown = own.predict_markers(own.nominal_parameters(), theta)
     np.testing.assert_allclose(shown, measured, atol=1e-9)
 
 

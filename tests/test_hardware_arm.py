@@ -53,7 +53,12 @@ from train.commands import hardware_compensate
 from train.commands.cli import main
 from train.commands.hardware import Emulate
 from train.commands.hardware_arm import KnownArm
-from train.commands.hardware_compensate import Compensate, LogPoses, approached, write_rests
+from train.commands.hardware_compensate import (
+    Compensate,
+    LogPoses,
+    poses_from_both_sides,
+    write_rests,
+)
 from train.runs.console import PlainConsole
 
 FOLDER = Path("docs/hardware")
@@ -593,7 +598,7 @@ def test_a_log_tells_the_servo_of_a_joint_that_moves_with_others(tmp_path: Path)
     """Catches torques of the other joints' motion that are taken for friction, and a rotor that is
     lost in the inertia of the links: without either, compensated tips were 6 mm apart from both
     sides, with both half a millimetre."""
-    _, files = logged(tmp_path, Plain(), approached(drawn(6), 0.15))
+    _, files = logged(tmp_path, Plain(), poses_from_both_sides(drawn(6), 0.15))
     fit = fit_servo([read_servo_log(files[1], joint="elbow_flex")], starts=1)
     assert fit.value("position_gain") == pytest.approx(11.95, rel=0.03)
     assert fit.value("rotor_inertia") == pytest.approx(0.0235, rel=0.15)
@@ -965,7 +970,7 @@ def test_an_arm_that_is_not_as_the_files_say_is_one_sentence_at_the_command_line
 ) -> None:
     """Catches a traceback, a wrong cause, and an exit code of success."""
     config = EmulatorConfig(model_number=777, ids=tuple(range(1, 7)), arm=emulated())
-    monkeypatch.setattr(command, "emulated", lambda _: config.replace(**changes))
+    monkeypatch.setattr(command, "emulator_config", lambda _: config.replace(**changes))
     files = ["--robot", ROBOT, "--joints", str(JOINTS), "--mounting", str(MOUNTING)]
     files += ["--targets", str(FOLDER / "so101_poses.csv"), "--output", str(tmp_path / "run")]
     with pytest.raises(SystemExit) as ended:
@@ -999,7 +1004,7 @@ def test_an_arm_runs_at_both_ends_of_its_range_of_rates(rate_hz: float) -> None:
 
 def test_poses_of_a_log_are_approached_from_both_sides(tmp_path: Path) -> None:
     """Catches a side that is told wrong, and a way to a pose that is logged as the pose."""
-    visits = approached(np.array([[0.5, 0.2]]), 0.1)
+    visits = poses_from_both_sides(np.array([[0.5, 0.2]]), 0.1)
     np.testing.assert_allclose(visits, [[0.4, 0.1], [0.5, 0.2], [0.6, 0.3], [0.5, 0.2]])
     rests = {
         i: SimpleNamespace(theta=np.array([q[0]]), torque=np.array([0.1 * i]))

@@ -33,8 +33,8 @@ from train.learn.phase_table import (
     Search,
     Walks,
     best,
-    corrected,
     find,
+    next_table,
     probe,
 )
 
@@ -160,7 +160,7 @@ def test_a_linear_plant_is_corrected_to_its_least_error() -> None:
 
     now = Harmonics(np.zeros(shape, dtype=np.complex128))
     for number in range(1, 12):
-        now = corrected(now, play(now), response, search)
+        now = next_table(now, play(now), response, search)
         left = np.abs(play(now).planes) / np.abs(without)
         np.testing.assert_allclose(left, 0.5**number, rtol=1e-4)
     for channel in range(2):

@@ -11,7 +11,7 @@ import elastic_env  # noqa: F401  registers the environments
 from baselines.compensation.compensators import Compensated, DynamicCompensator
 from baselines.compensation.policy import PolicyInputs, Zero
 from baselines.walking.controller import WalkingController
-from baselines.walking.foothold import RefinedWalk, refined
+from baselines.walking.foothold import RefinedWalk, refine_model
 from elastic_env.core.signals import Array
 from tests.played import play_to_the_end
 
@@ -40,7 +40,7 @@ def test_the_policy_sees_the_refined_plan_and_its_offset_adds_to_the_change() ->
     """Catches a row of another time, columns of another signal, and a change that is lost."""
     env = walker(scenario="ideal")
     model = env.unwrapped.assumed_model
-    further = refined(model)
+    further = refine_model(model)
     inside = Recorder(model)
     policy = RefinedWalk(inside, model, further)
     table = model.observation_table
@@ -66,7 +66,7 @@ def test_a_robot_without_friction_walks_with_a_third_of_the_error() -> None:
     for is_refined in (False, True):
         env = walker(scenario="ideal")
         model = env.unwrapped.assumed_model
-        walked = refined(model) if is_refined else model
+        walked = refine_model(model) if is_refined else model
         compensator = DynamicCompensator(walked, "wrench")
         policy: Any = Compensated(WalkingController(walked), compensator)
         if is_refined:

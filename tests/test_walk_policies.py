@@ -18,7 +18,7 @@ from baselines.compensation.oracle import Oracle, TrueSensors
 from baselines.compensation.policy import Zero
 from baselines.policies import sensors_needed
 from baselines.walking.controller import WalkingController, WalkingGains
-from baselines.walking.foothold import RefinedWalk, refined
+from baselines.walking.foothold import RefinedWalk, refine_model
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
 
@@ -299,12 +299,12 @@ def test_oracle_is_its_composition_with_the_true_model() -> None:
     true = env.unwrapped.truth().model
     assumed = env.unwrapped.assumed_model
     settings = {"friction": False, "integral_gain": 0.0, **AT_ONCE}
-    walked = refined(true)
+    walked = refine_model(true)
     by_hand, wrong = (
         RefinedWalk(Oracle(env, controller, walked, **settings), true, walked)
         for controller in (
             WalkingController(model, gains=QUICK_WALKING, **AT_ONCE)
-            for model in (walked, refined(assumed))
+            for model in (walked, refine_model(assumed))
         )
     )
     _, actions = run(baselines.make("oracle", env, **AT_ONCE), env, 20)

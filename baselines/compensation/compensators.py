@@ -335,7 +335,7 @@ class DynamicCompensator(Compensator):
         friction = memory.friction
         if self._rubs:
             friction = self._friction.follow(motion.q_dot * self._dt, friction)
-            torque = self._friction.passed(torque, motion.q_dot, friction)
+            torque = self._friction.joint_torque(torque, motion.q_dot, friction)
         offset, deflection, rate, windup = lead_motors(
             torque=torque,
             target=elasticity.static_deflection(torque, self._stiffness, self._backlash),

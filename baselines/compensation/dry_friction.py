@@ -92,7 +92,7 @@ class FrictionCompensation:
             slack=way - moved,
         )
 
-    def passed(self, torque: Array, speed: Array, memory: FrictionMemory) -> Array:
+    def joint_torque(self, torque: Array, speed: Array, memory: FrictionMemory) -> Array:
         """τ_J, (..., n) [N·m].
 
         Args:

@@ -400,7 +400,7 @@ class PositionCompensator:
         if q_dot is None:  # without what trembles
             q_dot = (displacement + slack - self._rubbed.slack) / self.constants.period_s
             q_dot[np.abs(q_dot) > self.constants.fastest] = 0.0  # a pose of its own, no motion
-        passed = self.constants.friction.passed(
+        passed = self.constants.friction.joint_torque(
             torque + self.constants.viscous * q_dot, q_dot, self._rubbed
         )
         lag = self.constants.lag_s * q_dot
@@ -414,7 +414,7 @@ class PositionCompensator:
         if self.constants.friction is None:
             return torque
         rate = np.zeros_like(torque) if motion[1] is None else motion[1]
-        return self.constants.friction.passed(
+        return self.constants.friction.joint_torque(
             torque + self.constants.viscous * rate, rate, self._rubbed
         )
 
@@ -429,7 +429,7 @@ class PositionCompensator:
         torque = self.constants.body.gravity_torque(q)
         if self.constants.friction is None:
             return torque
-        return self.constants.friction.passed(torque, np.zeros_like(q), self._rubbed)
+        return self.constants.friction.joint_torque(torque, np.zeros_like(q), self._rubbed)
 
     def _passed_gradient(self, q: Array) -> Array:
         """Its gradient, (..., n) [rad] to (..., n, n) [N·m/rad]."""

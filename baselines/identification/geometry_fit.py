@@ -247,10 +247,10 @@ class GeometryProblem:
 
     def residual(self, x: Array) -> Array:
         """Shown by the model less measured, (N k 3,) [m]."""
-        shown = self.model.measured(self.parameters(x), self.theta, self.axial)
+        shown = self.model.predict_markers(self.parameters(x), self.theta, self.axial)
         return (shown - self.measured).ravel()
 
-    def linearised(self, x: Array) -> tuple[Array, Array]:
+    def linearise(self, x: Array) -> tuple[Array, Array]:
         """The residual, (N k 3,) [m], and its derivatives by x, (N k 3, p)."""
         shown, gradient = self.model.gradient(self.parameters(x), self.theta, self.axial)
         rows = shown.size
@@ -296,9 +296,9 @@ class GeometryFit:
             for i in range(len(self.x))
         )
 
-    def missed(self, problem: GeometryProblem) -> Array:
+    def prediction_error(self, problem: GeometryProblem) -> Array:
         """Places of the markers less those that this fit predicts, (N, k, 3) [m]."""
-        shown = self.problem.model.measured(self.parameters, problem.theta, problem.axial)
+        shown = self.problem.model.predict_markers(self.parameters, problem.theta, problem.axial)
         return problem.measured - shown
 
 
@@ -320,7 +320,7 @@ def fit_geometry(problem: GeometryProblem) -> GeometryFit:
     noise = _FIRST_NOISE_M
     for _ in range(_NOISE_ROUNDS):
         x = _least(problem, x, noise)
-        residual, _ = problem.linearised(x)
+        residual, _ = problem.linearise(x)
         used = len(x) - float(np.trace(_covariance(problem, x, noise)))
         spread = np.sqrt(residual @ residual / max(len(residual) - used, 1.0))
         noise = max(float(spread), _FINEST_M)
@@ -331,7 +331,7 @@ def fit_geometry(problem: GeometryProblem) -> GeometryFit:
 
 def _covariance(problem: GeometryProblem, x: Array, noise: float) -> Array:
     """Of the unknowns in units of their priors, (p, p)."""
-    _, gradient = problem.linearised(x)
+    _, gradient = problem.linearise(x)
     rows = gradient * problem.unknowns.prior / noise
     return np.linalg.inv(rows.T @ rows + np.eye(len(x)))
 
@@ -352,7 +352,7 @@ def _least(problem: GeometryProblem, x: Array, noise: float) -> Array:
         return np.concatenate([missed, z])
 
     def jacobian(z: Array) -> Array:
-        _, gradient = problem.linearised(prior * z)
+        _, gradient = problem.linearise(prior * z)
         return np.concatenate([gradient * prior / noise, np.eye(len(z))])
 
     found = least_squares(
@@ -382,7 +382,7 @@ def align_tracker(model: GeometryModel, theta: Array, measured: Array) -> Geomet
     Raises:
         ConfigurationError: They spread far more or less than those of the model.
     """
-    own = model.measured(model.nominal_parameters(), theta).reshape(-1, 3)
+    own = model.predict_markers(model.nominal_parameters(), theta).reshape(-1, 3)
     shown = measured.reshape(-1, 3)
     own_m, shown_m = (float(np.std(points, axis=0).max()) for points in (own, shown))
     if not own_m / _UNLIKE < shown_m < own_m * _UNLIKE:

@@ -251,7 +251,7 @@ class GeometryModel:
             friction=np.zeros(n),
         )
 
-    def measured(
+    def predict_markers(
         self, parameters: Parameters, theta: Array, axial: AxialTorques | None = None
     ) -> Array:
         """Places of the markers as the tracker shows them, (N, k, 3) [m], at motor encoders (N, n).

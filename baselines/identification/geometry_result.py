@@ -43,7 +43,7 @@ class GeometryIdentification(Model):
     held_out: HeldOut | None = None
 
     @property
-    def kept(self) -> tuple[str, ...]:
+    def prior_parameters(self) -> tuple[str, ...]:
         """Parameters of which the poses tell no more than the prior, such as `elbow.x length`."""
         return tuple(
             f"{parameter.name} {parameter.kind}"

@@ -165,7 +165,7 @@ class Judged:
 
         def fit(inner: GeometryProblem) -> Missed:
             found = fit_geometry(inner)
-            return lambda poses: found.missed(problem.of_poses(poses))
+            return lambda poses: found.prediction_error(problem.of_poses(poses))
 
         return cls(
             theta=problem.theta,
@@ -183,7 +183,7 @@ class Judged:
 
         def fit(inner: PoseModel) -> Missed:
             found = solve_unknowns(inner)
-            return lambda poses: inner.at(model.log.part(poses)).missed(found)
+            return lambda poses: inner.at(model.log.part(poses)).prediction_error(found)
 
         of, unit = _SHOWN[model.log.kind]
         return cls(

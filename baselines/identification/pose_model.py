@@ -272,7 +272,7 @@ class PoseModel:
             return q[:, at], dq[:, at]
         return self._torques(unknowns, q, dq, at)
 
-    def missed(self, unknowns: Array) -> Array:
+    def prediction_error(self, unknowns: Array) -> Array:
         """Measured less predicted, (N, k, d): vectors of k places in the unit of the measurement.
 
         Places are a point, the end of a unit vertical, or the joints.

@@ -70,7 +70,7 @@ from elastic_env.world.foot_sensors import FootSensors
 from elastic_env.world.robot_model import WalkerModel
 
 
-def refined(model: WalkerModel) -> WalkerModel:
+def refine_model(model: WalkerModel) -> WalkerModel:
     """The assumed walker with its plan refined.
 
     Raises:
@@ -367,8 +367,8 @@ def feel_landing(rules: Any, planned: Any, shown: Any, own: Any) -> None:
     if 0.25 < shown.load_share < 0.75:
         left = shown.wrench[0, 0]
         right = shown.wrench[1, 0]
-        left_x, left_y = turned(left[0], left[1], planned.foot_yaw[0] - planned.heading)
-        right_x, right_y = turned(right[0], right[1], planned.foot_yaw[1] - planned.heading)
+        left_x, left_y = rotate(left[0], left[1], planned.foot_yaw[0] - planned.heading)
+        right_x, right_y = rotate(right[0], right[1], planned.foot_yaw[1] - planned.heading)
         shear = (0.5 * (left_x - right_x), 0.5 * (left_y - right_y))
         for i in range(2):
             commanded = own.offset[0, i] - own.offset[1, i]
@@ -386,7 +386,7 @@ def lift(rules: Any, planned: Any, own: Any, foot: int) -> None:
         gain = rules.gain if own.landings[standing] > 1.0 else rules.first_gain
         error_x = sign * own.total[0] / own.samples
         error_y = sign * own.total[1] / own.samples
-        moved = turned(error_x, error_y, planned.heading)
+        moved = rotate(error_x, error_y, planned.heading)
         for i, error in enumerate((error_x, error_y)):
             own.place[standing, i] = own.place[foot, i] + moved[i]
             own.landed[standing, i] = error
@@ -402,14 +402,14 @@ def lift(rules: Any, planned: Any, own: Any, foot: int) -> None:
 def aim(rules: Any, planned: Any, own: Any, foot: int) -> None:
     """Offset with which the foot in the air is to land."""
     standing = own.place[1 - foot]
-    back = turned(-standing[0], -standing[1], -planned.heading)
+    back = rotate(-standing[0], -standing[1], -planned.heading)
     for i in range(2):
         wanted = back[i] - own.bias[foot, i]
         own.target[foot, i] = min(max(wanted, -rules.limit_m), rules.limit_m)
 
 
 @compiled_part
-def turned(x: float, y: float, angle: float) -> tuple[float, float]:
+def rotate(x: float, y: float, angle: float) -> tuple[float, float]:
     """A vector turned about the vertical, to the left [rad]."""
     cosine = math.cos(angle)
     sine = math.sin(angle)

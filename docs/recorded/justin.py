@@ -320,10 +320,12 @@ def _errors_of(inner: RecordedPoses, outer: RecordedPoses, mass_factors: Array) 
         other = replace(problem, theta=outer.theta, measured=outer.measured)
         if not errors:
             rigid = fit_geometry(problem.as_rigid())
-            missed = (rigid.missed(problem), rigid.missed(other))
+            missed = (rigid.prediction_error(problem), rigid.prediction_error(other))
             rivals = rival_errors(problem.theta, missed[0], other.theta, missed[1])
             errors = {RIGID: np.linalg.norm(missed[1], axis=-1), **rivals}
-        errors[variant.name] = np.linalg.norm(fit_geometry(problem).missed(other), axis=-1)
+        errors[variant.name] = np.linalg.norm(
+            fit_geometry(problem).prediction_error(other), axis=-1
+        )
     return errors
 
 

@@ -66,12 +66,12 @@ def fold(folds: Any, signals: Array, masks: BoolArray, total: Array, count: IntA
             for world in range(values.shape[1]):
                 if is_sampled[step, world]:
                     before = total[row, world]
-                    total[row, world] = joined(statistic, before, values[step, world])
+                    total[row, world] = join_sample(statistic, before, values[step, world])
                     count[row, world] += 1
 
 
 @compiled_part
-def joined(statistic: int, before: float, value: float) -> float:
+def join_sample(statistic: int, before: float, value: float) -> float:
     """A statistic and the next sample; a sample that is nan makes all but the last value nan."""
     if statistic == 0:
         return before + value * value

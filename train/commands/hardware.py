@@ -26,7 +26,7 @@ from elastic_env.hardware.safety.checks import Check as BusCheck
 from elastic_env.hardware.safety.checks import check_bus
 from elastic_env.hardware.settings import HardwareSettings
 from elastic_env.robots.testbed.environment import configure_testbed
-from train.commands.hardware_arm import KnownArm, OnArm, emulated
+from train.commands.hardware_arm import KnownArm, OnArm, emulator_config
 from train.commands.hardware_compensate import Compensate, LogPoses
 from train.commands.options import MotionOrDefault, OnHardware
 from train.evaluate.conditions import Condition, PolicySpec
@@ -303,7 +303,7 @@ class Emulate(Model):
         if self.robot is None or self.joints is None or self.mounting is None:
             raise ConfigurationError("an emulated arm needs --robot, --joints and --mounting")
         arm = OnArm(robot=self.robot, mounting=self.mounting, dry_run=True)
-        return emulated(KnownArm(arm, self.joints))
+        return emulator_config(KnownArm(arm, self.joints))
 
 
 class Hardware(Model):

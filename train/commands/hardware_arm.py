@@ -250,8 +250,8 @@ def move_arm(
         )
         truth = None
         if options.dry_run:
-            bus = truth = stack.enter_context(VirtualBus(emulated(known)))
-            if stiffened(known):
+            bus = truth = stack.enter_context(VirtualBus(emulator_config(known)))
+            if stiffen_joints(known):
                 console.print(f"rigid joints are emulated with K = {STIFF_OVER_SERVO:g} k_p")
             _check_servos(known, bus.driver, console)
         else:
@@ -281,7 +281,7 @@ def move_arm(
 
 def plain_error(known: KnownArm, make_targets: MakeTargets) -> float:
     """True error of an emulated arm's tip at its poses without compensation, rms [m]."""
-    with VirtualBus(emulated(known)) as bus:
+    with VirtualBus(emulator_config(known)) as bus:
         arm = Arm(bus, known.settings, known.servos, Plain(known.compensator), known.ranges)
         targets = make_targets(arm.begin())
         ends: dict[int, tuple[Array, Array]] = {}
@@ -359,7 +359,7 @@ def _play(
     return rests
 
 
-def stiffened(known: KnownArm) -> dict[str, Any]:
+def stiffen_joints(known: KnownArm) -> dict[str, Any]:
     """Rigid joints whose servo gives way, which are not simulated, made stiff, by name."""
     found: dict[str, Any] = {}
     for joint, own in known.joint_settings.items():
@@ -371,13 +371,13 @@ def stiffened(known: KnownArm) -> dict[str, Any]:
     return found
 
 
-def emulated(known: KnownArm) -> EmulatorConfig:
+def emulator_config(known: KnownArm) -> EmulatorConfig:
     """The emulated arm of a dry run: the joints of the file on servos of the mounting."""
     names = [name for name in known.servos.models if name is not None]
     name = names[0] if names else _EMULATED[known.settings.protocol]
     arm = EmulatedArm(
         model=str(Path(known.options.robot).resolve()),
-        joints={**known.mapping, **stiffened(known)},
+        joints={**known.mapping, **stiffen_joints(known)},
         order=known.joints,
         direction=tuple(int(sign) for sign in known.servos.direction),
         zero_rad=tuple(known.servos.zero.tolist()),

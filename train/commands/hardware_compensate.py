@@ -108,7 +108,9 @@ class LogPoses(OnArm):
         self._drawn(known, known.middle)  # a bad file is told before anything moves
 
         def make_targets(start: Array) -> Targets:
-            return Poses(approached(self._drawn(known, start), self.apart_rad), self.hold_s)
+            return Poses(
+                poses_from_both_sides(self._drawn(known, start), self.apart_rad), self.hold_s
+            )
 
         folder, rests = move_arm(known, Plain(known.compensator), make_targets, console)
         path = write_rests(folder / "poses.csv", rests, known.joints)
@@ -129,7 +131,7 @@ class LogPoses(OnArm):
         return np.clip(start + self.within_rad * spread, lowest, highest)
 
 
-def approached(poses: Array, apart_rad: float) -> Array:
+def poses_from_both_sides(poses: Array, apart_rad: float) -> Array:
     """Poses before each of which the arm stands below and above it, (4 N, n) [rad]."""
     from_below = np.stack([poses - apart_rad, poses], axis=1)
     from_above = np.stack([poses + apart_rad, poses], axis=1)
@@ -141,7 +143,7 @@ def write_rests(path: Path, rests: dict[int, ArmState], joints: tuple[str, ...])
 
     Args:
         path: Where it goes.
-        rests: By number, as `approached` orders them.
+        rests: By number, as `poses_from_both_sides` orders them.
         joints: Names of the joints.
     """
     at_poses = [state for number, state in rests.items() if number % 2 == 1]

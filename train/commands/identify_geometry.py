@@ -140,9 +140,10 @@ def show_result(result: GeometryIdentification, console: Console) -> None:
             f"{result.numbers} measured numbers for {len(result.parameters)} parameters: most rests"
             " on the priors; log more poses"
         )
-    if result.kept:
+    unseen = result.prior_parameters
+    if unseen:
         console.print(
-            f"{len(result.kept)} of {len(result.parameters)} parameters keep their prior, as the"
-            f" poses do not tell them: {list_names(result.kept)}",
+            f"{len(unseen)} of {len(result.parameters)} parameters keep their prior, as the"
+            f" poses do not tell them: {list_names(unseen)}",
             highlight=False,
         )

@@ -21,16 +21,16 @@ from baselines.compensation.position_compensator import CompensatorConstants
 from elastic_env.core.errors import ElasticError
 from elastic_env.core.signals import Array
 from train.export.c_text import (
-    braced,
     comment,
-    enumerated,
+    enum_lines,
     fill,
     identifier,
     members,
-    nested,
     number,
+    number_list,
     numbers,
     plain,
+    row_lines,
     unique,
 )
 
@@ -91,8 +91,8 @@ def c_header(
         digest=digest,
         origin=comment(_origin_lines(sources or {})),
         joints=comment(_joint_lines(names, constants)),
-        joint_names=enumerated(unique(f"{capitals}_JOINT_", names)),
-        frame_names=enumerated(f"{capitals}_{frame.name}" for frame in frames),
+        joint_names=enum_lines(unique(f"{capitals}_JOINT_", names)),
+        frame_names=enum_lines(f"{capitals}_{frame.name}" for frame in frames),
         test=_test_vector(compensator, prefix),
     )
 
@@ -146,7 +146,7 @@ def _tables(constants: CompensatorConstants, frames: Sequence[Frame]) -> dict[st
         "presliding_rad": number(PRESLIDING_RAD),
         "links": ",\n".join(_link(row) for row in body.tree.links[1:]),
         "frames": ",\n".join(
-            f"    {{{one.body}, {one.link}, {braced(one.place)}, {braced(one.R)}}}"
+            f"    {{{one.body}, {one.link}, {number_list(one.place)}, {number_list(one.R)}}}"
             for one in frames
         ),
         **{name: numbers(values) for name, values in rows.items()},
@@ -194,9 +194,9 @@ def _test_vector(compensator: PositionCompensator, prefix: str) -> str:
         steps=_TEST_STEPS,
         loaded=_LOADED_STEP,
         payload=numbers((_PAYLOAD_KG, *_PAYLOAD_AT)),
-        motion=nested(motion),
-        command=nested(command),
-        link_angle=nested(link_angle),
+        motion=row_lines(motion),
+        command=row_lines(command),
+        link_angle=row_lines(link_angle),
     )
 
 

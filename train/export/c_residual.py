@@ -9,14 +9,14 @@ import elastic_env
 from baselines.residual.mirror import Mirror
 from elastic_env.core.signals import Array
 from train.export.c_text import (
-    braced,
     comment,
-    enumerated,
+    enum_lines,
     fill,
-    nested,
     number,
+    number_list,
     numbers,
     plain,
+    row_lines,
     unique,
 )
 from train.export.residual_layout import ResidualLayout
@@ -57,7 +57,7 @@ def c_residual(layout: ResidualLayout, prefix: str) -> str:
         widest=max(len(layout.features), *widths),
         decision_period=settings.decision_period,
         has_mirror=int(layout.mirrors is not None),
-        column_names=enumerated(
+        column_names=enum_lines(
             unique(f"{prefix.upper()}_", [signal.name for signal in layout.columns])
         ),
         mean=numbers(layout.tensors["mean"].astype(np.float64)),
@@ -73,9 +73,9 @@ def c_residual(layout: ResidualLayout, prefix: str) -> str:
         clip=number(layout.description.clip),
         share=number(facts["share_per_control_step"]),
         rows=_TEST_ROWS,
-        test_features=nested(drawn["features"]),
+        test_features=row_lines(drawn["features"]),
         test_foot=numbers(drawn["on_right"]),
-        test_decided=nested(decided),
+        test_decided=row_lines(decided),
     )
 
 
@@ -110,7 +110,7 @@ def _layers(layout: ResidualLayout, prefix: str) -> Iterator[str]:
         bias: Array = layout.tensors[f"bias{i}"].astype(np.float32)
         rows = ",\n".join(f"    {numbers(row)}" for row in W)
         yield f"static const float {prefix}_weight{i}_[{W.size}] = {{\n{rows}\n}};"
-        yield f"static const float {prefix}_bias{i}_[{bias.size}] = {braced(bias)};"
+        yield f"static const float {prefix}_bias{i}_[{bias.size}] = {number_list(bias)};"
 
 
 def _calls(layout: ResidualLayout, prefix: str, widths: list[int]) -> Iterator[str]:

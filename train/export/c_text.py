@@ -83,7 +83,7 @@ def numbers(values: Any) -> str:
     return ", ".join(map(number, np.ravel(values)))
 
 
-def braced(values: Any) -> str:
+def number_list(values: Any) -> str:
     """Numbers of a list."""
     return f"{{{numbers(values)}}}"
 
@@ -91,10 +91,10 @@ def braced(values: Any) -> str:
 def members(row: Any, names: str) -> str:
     """Members of a struct, numbers and flat lists of them; their names are parted by spaces."""
     values = [row[name] for name in names.split()]
-    return ", ".join(number(own) if np.ndim(own) == 0 else braced(own) for own in values)
+    return ", ".join(number(own) if np.ndim(own) == 0 else number_list(own) for own in values)
 
 
-def nested(values: Array) -> str:
+def row_lines(values: Array) -> str:
     """Rows of an array of two or more axes, a row of the first on a line."""
     return ",\n".join(f"    {initialiser(row)}" for row in values)
 
@@ -106,7 +106,7 @@ def initialiser(value: Any) -> str:
     return "{" + ", ".join(map(initialiser, value)) + "}"
 
 
-def enumerated(names: Iterable[str]) -> str:
+def enum_lines(names: Iterable[str]) -> str:
     """Names of an enumeration, a line each."""
     return ",\n".join(f"    {name}" for name in names)
 

@@ -29,15 +29,15 @@ from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array, IntArray
 from elastic_env.world.robot_model import WalkerModel
 from train.export.c_text import (
-    braced,
     comment,
     fill,
     initialiser,
     members,
-    nested,
     number,
+    number_list,
     numbers,
     plain,
+    row_lines,
 )
 
 _TEST_STEPS = 12
@@ -196,8 +196,8 @@ def _tables(policy: Compensated, model: WalkerModel) -> dict[str, str]:
         "ankle_height": number(contact["ankle_height"]),
         "sole_depth": number(model.biped.ankle_height),
         "links": ",\n".join(_link(row) for row in links),
-        "foot_R": ", ".join(braced(row["tip_R"]) for row in feet),
-        "foot_place": ", ".join(braced(row["tip_place"]) for row in feet),
+        "foot_R": ", ".join(number_list(row["tip_R"]) for row in feet),
+        "foot_place": ", ".join(number_list(row["tip_place"]) for row in feet),
         "stiffness": numbers(model.stiffness),
         "of_command": numbers(of_command),
         "friction": numbers(constants["friction_deflection"]),
@@ -230,7 +230,7 @@ def _tables_of_layers(layers: _Layers) -> dict[str, str]:
         **{name: number(value) for name, value in given.items()},
         "estimate_every": str(adaptive.every),
         "foot_mass": numbers(-mass),
-        "foot_point": ", ".join(map(braced, point)),
+        "foot_point": ", ".join(map(number_list, point)),
     }
 
 
@@ -262,8 +262,8 @@ def _test_vector(policy: Any, prefix: str) -> str:
         count=_TEST_STEPS,
         shown=_structs(played.shown),
         plan=_structs(played.plan),
-        offset=nested(played.offset),
-        links=nested(played.links),
+        offset=row_lines(played.offset),
+        links=row_lines(played.links),
     )
 
 

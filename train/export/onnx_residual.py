@@ -31,10 +31,10 @@ def onnx_model(layout: ResidualLayout) -> bytes:
     on_right = ""
     if layout.mirrors is not None:
         on_right = graph.take("on_right", 1, "the step is on the right foot", np.bool_)
-        seen = graph.mirrored(features, on_right, layout.mirrors[0])
+        seen = graph.mirror_on_right(features, on_right, layout.mirrors[0])
     residual = _network(graph, seen, layout)
     if layout.mirrors is not None:
-        residual = graph.mirrored(residual, on_right, layout.mirrors[1])
+        residual = graph.mirror_on_right(residual, on_right, layout.mirrors[1])
     graph.give("residual", residual, len(layout.residual), "what is decided, within [-1, 1]")
     of_columns = graph.add("Gather", residual, graph.keep(layout.source), axis=1)
     correction = graph.add("Mul", of_columns, graph.keep(layout.bounds))
@@ -117,7 +117,7 @@ class _Graph:
         """A value in another precision."""
         return self.add("Cast", value, to=self._type(kind))
 
-    def mirrored(self, value: str, on_right: str, mirror: Any) -> str:
+    def mirror_on_right(self, value: str, on_right: str, mirror: Any) -> str:
         """A value, or its image in the mirror in steps on the right foot."""
         other = self.add("Gather", value, self.keep(mirror.source), axis=1)
         image = self.add("Mul", other, self.keep(mirror.sign))

@@ -119,7 +119,7 @@ def probe(count: int, channel: int) -> Harmonics:
     return Harmonics(planes)
 
 
-def corrected(
+def next_table(
     now: Harmonics, error: Harmonics, response: ComplexArray, search: Search
 ) -> Harmonics:
     """The next table, see the module; the response is (planes, count, 2, 2)."""
@@ -220,7 +220,7 @@ def find(search: Search) -> PhaseTable:
         plays = [before]
         for number in range(search.plays):
             last = plays[-1]
-            now = corrected(last.inputs, last.errors, matrix, search)
+            now = next_table(last.inputs, last.errors, matrix, search)
             plays.append(play(now, f"table {number + 1}"))
     return best(plays).inputs.table(search)
 
