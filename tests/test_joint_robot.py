@@ -221,6 +221,23 @@ def test_what_cannot_be_says_why(arguments: dict[str, Any], message: str) -> Non
         scalar(**arguments)
 
 
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"home": 0.3}, "home must be a list, got 0.3"),
+        ({"home": ["low", 0.0, 0.0]}, "home.0 must be a valid number, got 'low'"),
+        ({"home": [0.0, float("nan"), 0.0]}, "home.1 must be a finite number, got nan"),
+        ({"load_kg": "heavy"}, "load_kg must be a valid number, got 'heavy'"),
+        ({"end_effector": ["tip"]}, r"end_effector must be text, got \['tip'\]"),
+        ({"imu": 5}, "imu must be text, got 5"),
+    ],
+)
+def test_values_of_a_robot_that_cannot_be_say_why(options: dict[str, Any], message: str) -> None:
+    """Catches a TypeError or ValueError of NumPy or MuJoCo for a wrong value."""
+    with pytest.raises(ConfigurationError, match=message):
+        JointRobot("wrong", rigid_arm, ARM.joints, **options).robot.make(scenario="payload")
+
+
 def test_what_is_no_robot_says_why(tmp_path: Path) -> None:
     """Catches an AttributeError for a name that stands for something else."""
     blind = JointRobot("blind", rigid_arm, ARM.joints).robot
@@ -228,6 +245,9 @@ def test_what_is_no_robot_says_why(tmp_path: Path) -> None:
         blind.make(sensors=["accelerometer"])
     with pytest.raises(ConfigurationError, match="home must have one angle per joint, 3, got 2"):
         JointRobot("short", rigid_arm, ARM.joints, home=[0.0, 1.0]).robot.make()
+    misnamed = JointRobot("misnamed", rigid_arm, ARM.joints, imu="nose").robot
+    with pytest.raises(ConfigurationError, match="unknown site for the IMU 'nose'; choose one of"):
+        misnamed.make(sensors=["accelerometer"])
     (tmp_path / "other.py").write_text("ARM = 3\n")
     from train.evaluate.environments import environment
 

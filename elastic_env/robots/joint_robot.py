@@ -20,7 +20,8 @@ import mujoco
 import numpy as np
 from mujoco import MjSpec
 
-from elastic_env.core.errors import ConfigurationError
+from elastic_env.core.config import Model
+from elastic_env.core.errors import ConfigurationError, require_known
 from elastic_env.core.signals import Array, BoolArray
 from elastic_env.joint.elasticity import ElasticJoint
 from elastic_env.joint.friction import passed_torque
@@ -53,6 +54,15 @@ _POINT = 1e-4
 """Moment of inertia of a point mass over its mass: that of a ball of 16 mm [m²]."""
 
 
+class RobotOptions(Model):
+    """Values of a `JointRobot` that are numbers and names."""
+
+    home: list[float] | None
+    imu: str | None
+    end_effector: str | None
+    load_kg: float | None
+
+
 @dataclass(frozen=True)
 class JointRobot:
     """A robot of elastic joints on a fixed base.
@@ -75,6 +85,9 @@ class JointRobot:
     imu: str | None = None
     end_effector: str | None = None
     load_kg: float | None = None
+
+    def __post_init__(self) -> None:
+        RobotOptions(**{name: getattr(self, name) for name in RobotOptions.model_fields})
 
     @property
     def id(self) -> str:
@@ -241,6 +254,7 @@ class JointRobot:
             if self.imu is None:
                 cure = "name its site, JointRobot(..., imu=SITE)"
                 raise ConfigurationError(f"{self.name} has no IMU: {cure}")
+            require_known("site for the IMU", [self.imu], [site.name for site in spec.sites])
             add_accelerometer(spec, self.imu)
         return spec
 
