@@ -1,5 +1,6 @@
 """References of robots of several joints, and what compensators leave of the sag in them."""
 
+import tracemalloc
 from pathlib import Path
 from typing import Any
 
@@ -82,6 +83,18 @@ def test_the_tool_goes_straight_and_round() -> None:
     np.testing.assert_allclose(circle[:, 1], 0.0, atol=1e-7)
 
 
+def test_a_line_needs_memory_for_its_steps_alone() -> None:
+    """Catches a table of all steps by all ways, which grows with the square of the ways."""
+    once = planned({"kind": "line", "duration_s": 0.8})[1]
+    config = configure_robot(reference={"kind": "line", "duration_s": 0.8, "repeats": 100})
+    tracemalloc.start()
+    plan = config.robot.plant(config).motion.plan(np.random.default_rng(0), 0.004)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 40 * plan.q.nbytes
+    np.testing.assert_allclose(plan.q[-400:], once.q[-400:], atol=1e-9)
+
+
 def test_poses_are_within_limits_and_at_rest_where_they_count() -> None:
     """Catches windows that begin before the robot stands, and poses that press a joint against
     its limit."""
@@ -136,9 +149,16 @@ def test_a_file_is_played_through_its_rows(tmp_path: Path) -> None:
         ({"kind": "csv", "file": "none.csv"}, r"no file of angles at none.csv"),
         ("pose", r"unknown reference 'pose'.*Did you mean 'poses'"),
         ({"kind": "moves", "move_s": 0.02}, r"'moves' can need .* make its moves slower"),
+        ({"kind": "line", "repeats": 100, "duration_s": 600.0}, r"at most 7200 s, got 120000 s;"),
+        ({"kind": "circle", "repeats": 13, "duration_s": 600.0}, r"at most 7200 s, got 7800 s; t"),
+        ({"kind": "poses", "positions": 1000, "settle_s": 600.0}, r"at most 7200 s, got 602250 s"),
+        ({"kind": "moves", "positions": 1000, "move_s": 600.0}, r"at most 7200 s, got 600000 s"),
+        ({"kind": "hold", "rate": 1e-9}, r"at most 7200 s, got 7.07659e\+09 s; take fewer"),
+        ({"kind": "steps", "moves": 1000, "move_s": 9.0}, r"at most 7200 s, got 10000 s; take few"),
     ],
 )
 def test_what_cannot_be_played_says_why(reference: Any, message: str) -> None:
+    """Catches a motion of days, whose tables take all memory."""
     with pytest.raises(ConfigurationError, match=message):
         planned(reference)
 

@@ -19,11 +19,17 @@ from elastic_env.core.signals import Array, BoolArray, IntArray
 from elastic_env.motion import references
 from elastic_env.motion.inverse_kinematics import joint_path
 from elastic_env.motion.references import AnyReference, RepeatableReference
-from elastic_env.motion.trajectory import STAND_S, Motion, Plan, control_times, quintic
+from elastic_env.motion.trajectory import (
+    LONGEST_S,
+    STAND_S,
+    Motion,
+    Plan,
+    control_times,
+    quintic,
+)
 from elastic_env.rigid.tree.end_effector import EndEffector
 
 _TRIES = 1000
-_LONGEST_S = 7200.0
 _SHORTEST_S = 1e-6
 _LARGEST_RAD = 1e4
 _MOST_ROWS = 2_000_000
@@ -219,12 +225,13 @@ class Line(_Path):
     def joint_plan(self, workspace: Workspace, period_s: float) -> Plan:
         """A plan of all joints, (T, n)."""
         way_s = self.duration_s
-        ways = np.arange(2 * self.repeats)
-        t = control_times(STAND_S + 2 * self.repeats * way_s, period_s)
-        since = (t[:, None] - STAND_S) / way_s - ways
-        phases = np.stack(quintic(since)) * np.where(ways % 2, -1.0, 1.0)
-        s, s_dot, s_ddot = phases.sum(axis=-1)
-        s = np.clip(s, 0.0, 1.0)
+        ways = 2 * self.repeats
+        t = control_times(STAND_S + ways * way_s, period_s)
+        number = _numbers(t, way_s, ways)
+        is_back = number % 2 == 1
+        phases = np.stack(quintic((t - STAND_S) / way_s - number))
+        s, s_dot, s_ddot = np.where(is_back, -phases, phases)
+        s = s + is_back
 
         def place(way: Array) -> Array:
             return way[..., None] * np.array(self.by)
@@ -344,9 +351,9 @@ def _table(file: Path, joints: tuple[str, ...]) -> tuple[list[str], Array]:
         raise ConfigurationError(
             f"{file} must have two rows or more, and a column of angles or more beside time_s"
         )
-    if (np.diff(t) <= 0.0).any() or t[-1] - t[0] > _LONGEST_S:
+    if (np.diff(t) <= 0.0).any() or t[-1] - t[0] > LONGEST_S:
         raise ConfigurationError(
-            f"time_s of {file} must increase from row to row, over at most {_LONGEST_S:g} s"
+            f"time_s of {file} must increase from row to row, over at most {LONGEST_S:g} s"
         )
     if np.diff(t).min() < _SHORTEST_S or np.abs(rows[:, 1:]).max() > _LARGEST_RAD:
         raise ConfigurationError(

@@ -27,21 +27,7 @@ from elastic_env.motion.trajectory import (
     quintic_moves,
 )
 
-_LONGEST_S = 7200.0
 _LONGEST_SUM_S = 36_000.0
-
-
-def _require_short(duration_s: float) -> None:
-    """Refuse a motion that lasts at least as long [s]: its tables hold every control step.
-
-    Raises:
-        ValueError: It is too long.
-    """
-    if duration_s > _LONGEST_S:
-        raise ValueError(
-            f"a motion must last at most {_LONGEST_S:g} s, got {duration_s:.0f} s or more; take"
-            " fewer or quicker moves"
-        )
 
 
 class RepeatableReference(Model):
@@ -120,12 +106,6 @@ class Hold(_JointReference):
         if self.upper <= self.lower:
             given = f"lower {self.lower} and upper {self.upper}"
             raise ValueError(f"upper must exceed lower, got {given}")
-        angles = self.angles
-        way = 2.0 * float(angles[-1] - angles[0]) + 3.0 * self.overrun
-        quickest_s = (2 * self.positions + 1) * self.shortest_move_s
-        moves_s = max(QUINTIC_PEAK_RATE * way / self.rate, quickest_s)
-        rest_s = self.settle_s + self.measure_s
-        _require_short(STAND_S + moves_s + 2 * self.positions * rest_s)
 
     @property
     def angles(self) -> Array:
@@ -307,9 +287,6 @@ class Steps(_JointReference):
     """Number of moves [1]."""
     seed: int | None = quantity("1", None, ge=0, le=LARGEST_SEED)
     """Seed of the levels; None draws new ones per episode [1]."""
-
-    def _check(self) -> None:
-        _require_short(STAND_S + self.moves * (self.move_s + self.rest_s))
 
     @override
     def extent(self) -> Extent:

@@ -10,6 +10,8 @@ from elastic_env.core.signals import Array, BoolArray, IntArray
 
 STAND_S = 1.0
 """Time at the first position in which policies ramp in; not scored."""
+LONGEST_S = 7200.0
+"""Longest motion after it [s]: tables hold every control step."""
 
 QUINTIC_PEAK_RATE = 15.0 / 8.0
 QUINTIC_PEAK_ACCELERATION = 10.0 / np.sqrt(3.0)
@@ -92,7 +94,16 @@ def quintic_moves(
 
 
 def control_times(duration_s: float, control_period_s: float) -> Array:
-    """Ends of the control periods within a duration, from 0 [s]."""
+    """Ends of the control periods within a duration, from 0 [s].
+
+    Raises:
+        ConfigurationError: It is longer than `LONGEST_S` after the standing.
+    """
+    if duration_s > STAND_S + LONGEST_S:
+        raise ConfigurationError(
+            f"a motion must last at most {LONGEST_S:g} s, got {duration_s - STAND_S:.6g} s; take"
+            " fewer or quicker moves"
+        )
     return np.arange(round(duration_s / control_period_s) + 1) * control_period_s
 
 
