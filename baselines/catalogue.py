@@ -111,7 +111,7 @@ class PolicyOptions(Model):
     """
     learning: LearningGains = LearningGains()
     """How `iterative` learns, and from how many trials."""
-    ramp_s: float = quantity("s", STAND_S, gt=0)
+    ramp_s: float = quantity("s", STAND_S, gt=0, le=3600)
     """Time in which the compensation grows from zero [s]."""
 
 

@@ -108,10 +108,6 @@ def make(name: str, env: Any, /, **options: Any) -> Policy:
         ConfigurationError: Unknown name or option, one without effect, or an environment that is
             not ours.
     """  # noqa: E501
-    if name.startswith(RESIDUAL):
-        return _residual_policy(Path(name.removeprefix(RESIDUAL)), env, options)
-    if name.startswith(ITERATIVE):
-        return _learned_policy(Path(name.removeprefix(ITERATIVE)), env, options)
     if not hasattr(env.unwrapped, "assumed_model"):
         raise ConfigurationError(
             "a baseline needs an environment with an assumed model, got"
@@ -119,6 +115,10 @@ def make(name: str, env: Any, /, **options: Any) -> Policy:
             ' gymnasium.make("elastic_env/Testbed-v0") and pass it here, also if the policy is to'
             " run on a wrapper of it"
         )
+    if name.startswith(RESIDUAL):
+        return _residual_policy(Path(name.removeprefix(RESIDUAL)), env, options)
+    if name.startswith(ITERATIVE):
+        return _learned_policy(Path(name.removeprefix(ITERATIVE)), env, options)
     given = {option: value for option, value in options.items() if value is not None}
     chosen = PolicyOptions(**given)
     is_walker = isinstance(env.unwrapped.assumed_model, WalkerModel)

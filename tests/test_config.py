@@ -38,6 +38,8 @@ class Outer(Model):
     """An unbounded angle [rad]."""
     inner: Inner = Inner()
     name: str = "x"
+    way: tuple[float, float] = (0.0, 1.0)
+    file: Path | None = None
 
 
 @pytest.mark.parametrize(
@@ -68,6 +70,8 @@ class Outer(Model):
             r"unknown parameter of inner 'lenght'; choose one of: length.*'length'",
         ),
         ({"rate": 1.0, "inner": 5}, r"Outer\.inner must be a mapping of parameters, got 5"),
+        ({"rate": 1.0, "way": [2.0]}, r"Outer\.way must have an entry 2, got \[2\.0\]"),
+        ({"rate": 1.0, "file": 5}, r"Outer\.file must be a path, got 5"),
     ],
 )
 def test_a_wrong_value_names_parameter_unit_bound_and_itself(

@@ -400,12 +400,21 @@ def test_unknown_method_lists_the_choices(option: str, choices: tuple[str, ...])
     assert all(word in str(caught.value) for word in (option, "magic", *choices))
 
 
-def test_ramp_must_be_positive() -> None:
-    """Catches a division by zero in the ramp."""
+@pytest.mark.parametrize("ramp_s", [0.0, 1e9])
+def test_ramp_must_be_positive_and_end(ramp_s: float) -> None:
+    """Catches a division by zero in the ramp, and a table of it that no memory holds."""
     with pytest.raises(
-        ConfigurationError, match=r"ramp_s must be a finite number > 0 \[s\], got 0"
+        ConfigurationError,
+        match=rf"ramp_s must be a finite number > 0 and <= 3600 \[s\], got {ramp_s}",
     ):
-        baselines.make("input", scalar(), ramp_s=0.0)
+        baselines.make("input", scalar(), ramp_s=ramp_s)
+
+
+@pytest.mark.parametrize("name", ["input", "residual:testbed/seed_0", "iterative:nowhere"])
+def test_an_environment_that_is_not_ours_is_named(name: str) -> None:
+    """Catches an AttributeError of a folder that is read before the environment is looked at."""
+    with pytest.raises(ConfigurationError, match="an assumed model, got CartPoleEnv; make one"):
+        baselines.make(name, gymnasium.make("CartPole-v1"))
 
 
 def test_oracle_takes_no_stiffness() -> None:

@@ -890,6 +890,9 @@ def test_a_list_of_seeds_needs_one_per_world() -> None:
     env = make_testbed_vector(3)
     with pytest.raises(ConfigurationError, match="one seed per world, 3, got 2"):
         env.reset(seed=[1, 2])
+    for seed in ([1, 2, "three"], [1, 2, 2.5]):
+        with pytest.raises(ConfigurationError, match=r"must be a whole number, one per .* \[1, 2,"):
+            env.reset(seed=seed)
 
 
 @pytest.mark.parametrize(

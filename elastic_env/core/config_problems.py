@@ -125,6 +125,8 @@ def _problem(model: type[BaseModel], path: ParameterPath, problem: Any) -> Probl
         case "extra_forbidden":
             choices = choices_listed(path[-1], model.model_fields)
             return Problem(path, "unknown", choices)
+        case "missing" if isinstance(path[-1], int):  # of a list of a fixed length
+            return Problem(path[:-1], "must", f"must have an entry {path[-1] + 1}, got {given}")
         case "missing":
             meaning = f": {field.description}" if field and field.description else ""
             return Problem(path, "missing", f"{_unit(field)}{meaning}")
@@ -151,6 +153,7 @@ _REQUIREMENTS = {
     "list_type": "be a list",
     "tuple_type": "be a list",
     "string_type": "be text",
+    "path_type": "be a path",
     "greater_than": "be > {gt:.6g}",
     "greater_than_equal": "be >= {ge:.6g}",
     "less_than": "be < {lt:.6g}",

@@ -328,13 +328,14 @@ def _seeds(seed: Any, num_envs: int, name: str = "seed") -> list[int | None]:
         return [None] * num_envs
     if isinstance(seed, int | np.integer):
         return [int(seed) + i for i in range(num_envs)]
-    if not isinstance(seed, Sequence | np.ndarray) or isinstance(seed, str):
+    each = list(seed) if isinstance(seed, Sequence | np.ndarray) else [seed]
+    if not all(isinstance(one, int | np.integer | None) for one in each):
         needed = f"a whole number, one per world ({num_envs}), or None"
         raise ConfigurationError(f"{name} must be {needed}; got {quote(seed)}")
-    if len(seed) != num_envs:
+    if len(each) != num_envs:
         needed = f"must have one seed per world, {num_envs}"
-        raise ConfigurationError(f"a list of seeds {needed}, got {len(seed)}")
-    return [None if one is None else int(one) for one in seed]
+        raise ConfigurationError(f"a list of seeds {needed}, got {len(each)}")
+    return [None if one is None else int(one) for one in each]
 
 
 def reset_mask(options: Info | None, num_envs: int) -> BoolArray:
