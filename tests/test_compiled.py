@@ -346,7 +346,7 @@ for step in range(6):
     steps = [policy.predict(row, state, start) for policy, state in zip(walk, states)]
     states, start = [state for _, state in steps], False
     row = env.step(steps[0][0])[0]
-    memories = [x for state in states for x in state.feedback[0].tolist()]
+    memories = [x for state in states for x in state.own[0].tolist()]
     print(*[float(x) for action, _ in steps for x in action], *np.hstack(memories).tolist())
 assert np.isfinite(row).all() and len(row) == 95
 """

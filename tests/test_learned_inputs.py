@@ -107,7 +107,7 @@ def test_feet_landing_and_shear_are_what_the_foothold_correction_knows() -> None
     """Catches feet that change places, the errors of an earlier landing, and shear of the last
     double support."""
     _, base, observations, states = walked(2, 1250)
-    inner = [None if state is None else state.inner.footholds for state in states]
+    inner = [None if state is None else state.inner.own for state in states]
     seen = []
     for k in range(250, 1250, 25):
         own = inner[k]

@@ -95,9 +95,9 @@ def played_in_c(
 
 def remembered(memory: Any) -> Array:
     """What the header of adaptive_posture remembers, from the policy's memory; else nothing."""
-    if not hasattr(memory, "feedback"):
+    if not hasattr(memory, "own"):
         return np.empty(0)
-    feedback = memory.feedback[0]
+    feedback = memory.own[0]
     estimate = memory.inner.estimator.observer[0]
     rolls = [estimate["unknowns"][:, 0], estimate["covariance"][:, 0]]
     posture = [feedback[name] for name in ("tilt", "integral", "trim", "kept")]
@@ -140,7 +140,7 @@ def test_adaptive_posture_in_c_walks_as_python_does(compiler: str, tmp_path: Pat
     steps = play_observations(policy, np.array(rows, dtype=np.float64))
     np.testing.assert_array_equal(steps.memory.inner.correction, state.inner.correction)
     assert (steps.memory.inner.correction[0, [1, 7]] > 0.1).all()
-    assert np.all(steps.memory.feedback["trim"] != 0.0)
+    assert np.all(steps.memory.own["trim"] != 0.0)
     compare(policy, steps, compiler, tmp_path)
 
 

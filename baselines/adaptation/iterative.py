@@ -47,20 +47,26 @@ measured.
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from typing_extensions import override
 
 from baselines.compensation.measured import LINK_ENCODER
-from baselines.compensation.policy import Policy, PolicyAround, PolicyInputs, Step
+from baselines.compensation.policy import (
+    MemoryAround,
+    Policy,
+    PolicyAround,
+    PolicyInputs,
+    Step,
+)
 from baselines.compensation.startup import Ramp
 from baselines.walking.mean_zmp import FlatFeet
 from baselines.walking.posture import hip_offsets
 from baselines.walking.zmp_shift import zmp_shift_offsets
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.errors import ConfigurationError, ElasticError
-from elastic_env.core.signals import Array, BoolArray, IntArray
+from elastic_env.core.signals import Array, BoolArray
 from elastic_env.world.robot_model import RobotModel, WalkerModel
 
 _ORDER = 2  # of the filter, which acts twice
@@ -274,13 +280,6 @@ _RETREAT = 0.5
 """Share of the offsets that is kept after a trial that failed, such as by a fall."""
 
 
-class LearnedMemory(NamedTuple):
-    """Control steps since the start of the episode, (num_worlds,), and the memory of the policy."""
-
-    steps: IntArray
-    inner: Any
-
-
 class LearnedOffsets(PolicyAround):
     """Any policy with a table of offsets added, row by row from the start of an episode.
 
@@ -293,6 +292,9 @@ class LearnedOffsets(PolicyAround):
     Attributes:
         tables: What was learned, for every world or for all of them alike, (num_worlds or 1, T, k).
     """
+
+    memory_type = np.int64
+    """Control steps since the start of the episode."""
 
     def __init__(
         self, policy: Policy, model: RobotModel, signals: LearnedSignals, ramp_s: float
@@ -320,22 +322,17 @@ class LearnedOffsets(PolicyAround):
         self.tables = tables
 
     @override
-    def begin(self, rows: Array) -> LearnedMemory:
-        steps = np.zeros(len(rows), dtype=np.int64)
-        return LearnedMemory(steps, self.policy.begin(rows))
-
-    @override
-    def act(self, rows: Array, memory: LearnedMemory, inputs: PolicyInputs) -> Step:
+    def act(self, rows: Array, memory: MemoryAround, inputs: PolicyInputs) -> Step:
         """After the last row of the table its offsets stay."""
         action, inner = self.policy.act(rows, memory.inner, inputs)
-        steps = memory.steps + 1
+        steps = memory.own + 1
         tables = len(self._offsets)
         if tables not in (1, len(rows)):
             learned = f"learned in {tables} worlds, one each"
             raise ElasticError(f"the offsets were {learned}, and are played in {len(rows)}")
         row = np.minimum(steps, self._offsets.shape[1] - 1)
         offsets = self._offsets[np.arange(len(rows)) if tables > 1 else 0, row]
-        return (action + offsets).astype(np.float32), LearnedMemory(steps, inner)
+        return (action + offsets).astype(np.float32), MemoryAround(steps, inner)
 
 
 @dataclass(frozen=True)

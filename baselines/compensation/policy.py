@@ -172,19 +172,36 @@ class BatchPolicy(ABC):
         return self.view.theta(rows)
 
 
+class MemoryAround(NamedTuple):
+    """Memory of a policy around another one: rows of its own, (num_worlds, ...), and that of it."""
+
+    own: Any
+    inner: Any
+
+
 class PolicyAround(BatchPolicy):
     """A policy around another one, whose memory is the field `inner` of its own.
 
     Args:
         policy: Any policy.
         model: Assumed robot.
+
+    Attributes:
+        memory_type: Type of the rows of a `MemoryAround`, which are zero at the start; a policy
+            with other memory begins it itself.
     """
+
+    memory_type: Any
 
     def __init__(self, policy: Any, model: RobotModel) -> None:
         super().__init__(model)
         self.policy = as_batch_policy(policy, model)
         self.inputs = self.policy.inputs
         self.estimates = self.policy.estimates
+
+    @override
+    def begin(self, rows: Array) -> Any:
+        return MemoryAround(np.zeros(len(rows), self.memory_type), self.policy.begin(rows))
 
     def inner_memory(self, memory: Any) -> Any:
         """Memory of the policy inside."""

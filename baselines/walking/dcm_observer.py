@@ -24,15 +24,15 @@ answer slow shifts so. They sway under those of a second, which the filters keep
 [Ohnishi1996] see `baselines.adaptation.disturbance_observer`.
 """
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from typing_extensions import override
 
 from baselines.compensation.policy import (
+    MemoryAround,
     PolicyAround,
     PolicyInputs,
-    Records,
     Step,
     WalkView,
     filter_share,
@@ -68,13 +68,6 @@ OBSERVED = record_type(
 """Memory of the observer."""
 
 
-class DcmMemory(NamedTuple):
-    """Memory of a policy with an observer: rows of `OBSERVED`, and that of the policy."""
-
-    observed: Records
-    inner: Any
-
-
 class DcmObserver(PolicyAround):
     """A policy of a walker whose observed disturbance is met, see the module.
 
@@ -84,6 +77,8 @@ class DcmObserver(PolicyAround):
         gains: Filters and bound.
         ramp_s: Time in which the shift grows from zero [s].
     """
+
+    memory_type = OBSERVED
 
     def __init__(
         self, policy: Any, model: WalkerModel, gains: DcmObserverGains, ramp_s: float = STAND_S
@@ -109,13 +104,9 @@ class DcmObserver(PolicyAround):
         self._ramp = minimum_jerk(np.arange(steps + 1) / steps)
 
     @override
-    def begin(self, rows: Array) -> DcmMemory:
-        return DcmMemory(np.zeros(len(rows), OBSERVED), self.policy.begin(rows))
-
-    @override
-    def act(self, rows: Array, memory: DcmMemory, inputs: PolicyInputs) -> Step:
+    def act(self, rows: Array, memory: MemoryAround, inputs: PolicyInputs) -> Step:
         """Its shift, by what was seen up to the last control step, adds to the input `zmp`."""
-        now = memory.observed.copy()
+        now = memory.own.copy()
         shift = np.empty((len(rows), 2))
         meet_disturbance(self._constants, self._ramp, now, shift)
         zmp = shift if inputs.zmp is None else inputs.zmp + shift
@@ -124,7 +115,7 @@ class DcmObserver(PolicyAround):
         seen = self._chains.com_and_feet(links, self._sole, rows[:, self._attitude])
         error = np.nan_to_num(self._feet.zmp_error(rows), nan=0.0) - shift
         observe(self._constants, self._walk_view.fields(rows), self._plan, *seen, error, now)
-        return action, DcmMemory(now, inner)
+        return action, MemoryAround(now, inner)
 
 
 @compiled

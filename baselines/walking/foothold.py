@@ -45,16 +45,16 @@ which this foot landed before. While the foot takes over the load, its offset go
 
 import math
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from typing_extensions import override
 
 from baselines.compensation.policy import (
+    MemoryAround,
     PassingMemory,
     PolicyAround,
     PolicyInputs,
-    Records,
     Step,
     WalkView,
     record_row,
@@ -130,13 +130,6 @@ TARE = record_type(
 """Memory of the tare."""
 
 
-class FootTareMemory(NamedTuple):
-    """Memory of a policy with tared feet: rows of `TARE`, and that of the policy."""
-
-    tare: Records
-    inner: Any
-
-
 class FootTare(PolicyAround):
     """A policy of a walker that sees its foot sensors set to zero, see the module.
 
@@ -146,6 +139,8 @@ class FootTare(PolicyAround):
         gains: When and how far.
     """
 
+    memory_type = TARE
+
     def __init__(self, policy: Any, model: WalkerModel, gains: FootTareGains) -> None:
         super().__init__(policy, model)
         self._walk_view = WalkView(model.observation_table)
@@ -153,17 +148,13 @@ class FootTare(PolicyAround):
         self._unloaded = unloaded_wrench(model)
 
     @override
-    def begin(self, rows: Array) -> FootTareMemory:
-        return FootTareMemory(np.zeros(len(rows), TARE), self.policy.begin(rows))
-
-    @override
-    def act(self, rows: Array, memory: FootTareMemory, inputs: PolicyInputs) -> Step:
+    def act(self, rows: Array, memory: MemoryAround, inputs: PolicyInputs) -> Step:
         rows = rows.copy()
-        tare = memory.tare.copy()
+        tare = memory.own.copy()
         observed = self._walk_view.fields(rows)
         tare_feet(self._gains, self._unloaded, observed, tare)
         action, inner = self.policy.act(rows, memory.inner, inputs)
-        return action, FootTareMemory(tare, inner)
+        return action, MemoryAround(tare, inner)
 
 
 def unloaded_wrench(model: WalkerModel) -> Array:
@@ -270,13 +261,6 @@ _KNOWN = {
 """What the correction knows, in the plan's local frame; `shear` is zero before both feet carry."""
 
 
-class FootholdMemory(NamedTuple):
-    """Memory of a policy with foothold correction: rows of `FOOTHOLDS`, and that of the policy."""
-
-    footholds: Records
-    inner: Any
-
-
 class FootholdCorrection(PolicyAround):
     """A policy of a walker whose feet land where they are planned, see the module.
 
@@ -285,6 +269,8 @@ class FootholdCorrection(PolicyAround):
         model: Assumed walker.
         gains: Gains.
     """
+
+    memory_type = FOOTHOLDS
 
     def __init__(self, policy: Any, model: WalkerModel, gains: FootholdGains) -> None:
         super().__init__(policy, model)
@@ -296,14 +282,14 @@ class FootholdCorrection(PolicyAround):
         self.estimates = {**self.policy.estimates, **_KNOWN}
 
     @override
-    def begin(self, rows: Array) -> FootholdMemory:
-        footholds = np.zeros(len(rows), FOOTHOLDS)
-        footholds["swing"] = -1.0
-        return FootholdMemory(footholds, self.policy.begin(rows))
+    def begin(self, rows: Array) -> MemoryAround:
+        memory = super().begin(rows)
+        memory.own["swing"] = -1.0
+        return memory
 
     @override
-    def estimate(self, name: str, rows: Array, memory: FootholdMemory) -> Array:
-        own = memory.footholds
+    def estimate(self, name: str, rows: Array, memory: MemoryAround) -> Array:
+        own = memory.own
         if name == "feet":
             heading = self._plan["heading"].take(self.view.plan_row(rows), mode="clip")
             return turn(own["place"], -heading[:, None]).reshape(len(rows), 4)
@@ -314,15 +300,15 @@ class FootholdCorrection(PolicyAround):
         return super().estimate(name, rows, memory)
 
     @override
-    def act(self, rows: Array, memory: FootholdMemory, inputs: PolicyInputs) -> Step:
+    def act(self, rows: Array, memory: MemoryAround, inputs: PolicyInputs) -> Step:
         action, inner = self.policy.act(rows, memory.inner, inputs)
         observed = self._walk_view.fields(rows)
-        now = memory.footholds.copy()
+        now = memory.own.copy()
         coming: IntArray = np.empty(len(rows), dtype=np.int64)
         correct_footholds(self._gains, self._plan, observed, now, coming)
         total = action.astype(np.float64)
         move_feet(*self._stances, coming, np.ascontiguousarray(now["offset"]), total)
-        return total.astype(np.float32), FootholdMemory(now, inner)
+        return total.astype(np.float32), MemoryAround(now, inner)
 
 
 @compiled

@@ -36,6 +36,7 @@ import numpy as np
 from typing_extensions import override
 
 from baselines.compensation.policy import (
+    MemoryAround,
     PolicyAround,
     PolicyInputs,
     Step,
@@ -159,13 +160,6 @@ class ZmpOffsetGains(Model):
     """Largest shift forward and sideways [m]."""
 
 
-class ZmpOffsetMemory(NamedTuple):
-    """Shift of the ZMP forward and left, (num_worlds, 2) [m], and the memory of the policy."""
-
-    shift: Array
-    inner: Any
-
-
 IN_PLANE: dict[str, Mirrored | None] = {"x": "same", "y": "opposite"}
 _SHIFT = SignalGroup.of(
     "zmp_offset",
@@ -185,6 +179,9 @@ class ZmpOffset(PolicyAround):
         gains: Gains.
     """
 
+    memory_type = (np.float64, 2)
+    """Shift of the ZMP forward and left [m]."""
+
     def __init__(self, policy: Any, model: WalkerModel, gains: ZmpOffsetGains) -> None:
         super().__init__(policy, model)
         self._feet = FlatFeet(model, LEAST_LOAD * model.biped.weight)
@@ -193,23 +190,19 @@ class ZmpOffset(PolicyAround):
         self.estimates = {**self.policy.estimates, "zmp_offset": _SHIFT}
 
     @override
-    def begin(self, rows: Array) -> ZmpOffsetMemory:
-        return ZmpOffsetMemory(np.zeros((len(rows), 2)), self.policy.begin(rows))
-
-    @override
-    def estimate(self, name: str, rows: Array, memory: ZmpOffsetMemory) -> Array:
+    def estimate(self, name: str, rows: Array, memory: MemoryAround) -> Array:
         if name == "zmp_offset":
-            return memory.shift
+            return memory.own
         return super().estimate(name, rows, memory)
 
     @override
-    def act(self, rows: Array, memory: ZmpOffsetMemory, inputs: PolicyInputs) -> Step:
+    def act(self, rows: Array, memory: MemoryAround, inputs: PolicyInputs) -> Step:
         """Its shift adds to the input `zmp`."""
-        shift = memory.shift.copy()
+        shift = memory.own.copy()
         zmp = np.zeros_like(shift) if inputs.zmp is None else inputs.zmp.copy()
         integrate(self._feet.zmp_error(rows), self._rate, self._limit, shift, zmp)
         action, inner = self.policy.act(rows, memory.inner, inputs._replace(zmp=zmp))
-        return action, ZmpOffsetMemory(shift, inner)
+        return action, MemoryAround(shift, inner)
 
 
 @compiled
@@ -220,7 +213,7 @@ def integrate(error: Array, rate: float, limit: float, shift: Array, zmp: Array)
         error: Measured less planned ZMP, (n, 2) [m]; nan where the feet carry too little.
         rate: Share of the error that is taken off in a control period [1].
         limit: Largest shift forward and sideways [m].
-        shift: Of `ZmpOffsetMemory`, (n, 2) [m].
+        shift: Of the planned ZMP, (n, 2) [m].
         zmp: To be added to, (n, 2) [m].
     """
     for world in range(len(shift)):

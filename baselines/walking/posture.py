@@ -22,13 +22,13 @@ when the ramp has ended, as the tilt before that is not the one of the walk.
 Tracking", IROS.
 """
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from typing_extensions import override
 
 from baselines.compensation import policy as policies
-from baselines.compensation.policy import Records, Step
+from baselines.compensation.policy import Step
 from baselines.compensation.startup import Ramp
 from elastic_env.core.compiled import compiled, compiled_part, record_type
 from elastic_env.core.config import Model, quantity
@@ -71,13 +71,6 @@ FEEDBACK = record_type(
 """Memory of the posture feedback."""
 
 
-class PostureMemory(NamedTuple):
-    """Memory of a policy with posture feedback: rows of `FEEDBACK`, and that of the policy."""
-
-    feedback: Records
-    inner: Any
-
-
 class PostureFeedback(policies.PolicyAround):
     """Any policy of a walker with its posture held by the hips, see the module.
 
@@ -91,6 +84,8 @@ class PostureFeedback(policies.PolicyAround):
         gains: Gains.
         ramp_s: Time in which the feedback grows from zero [s].
     """
+
+    memory_type = FEEDBACK
 
     def __init__(
         self, policy: Any, model: Any, gains: PostureGains, ramp_s: float = STAND_S
@@ -112,11 +107,7 @@ class PostureFeedback(policies.PolicyAround):
         )
 
     @override
-    def begin(self, rows: Array) -> PostureMemory:
-        return PostureMemory(np.zeros(len(rows), FEEDBACK), self.policy.begin(rows))
-
-    @override
-    def act(self, rows: Array, memory: PostureMemory, inputs: Any) -> Step:
+    def act(self, rows: Array, memory: policies.MemoryAround, inputs: Any) -> Step:
         """It takes the input `posture_gain`."""
         change = _NO_CHANGE
         if inputs.posture_gain is not None:
@@ -126,9 +117,9 @@ class PostureFeedback(policies.PolicyAround):
         total = action.astype(np.float64)
         feedback = np.empty(len(rows), FEEDBACK)
         observed = self._walk_view.fields(rows)
-        memories = (memory.feedback, feedback)
+        memories = (memory.own, feedback)
         hold_posture(self.gains, observed, self.ramp, change, *memories, total)
-        return total.astype(np.float32), PostureMemory(feedback, inner)
+        return total.astype(np.float32), policies.MemoryAround(feedback, inner)
 
 
 _NO_CHANGE: Array = np.empty((0, 1))
