@@ -36,6 +36,7 @@ LOOKS: dict[str, Callable[[Any], Any]] = {
     "get nothing": lambda d: d.get("none", 7),
     "in": lambda d: ("late" in d, "none" in d),
     "iter": list,
+    "reversed": lambda d: list(reversed(d)),
     "len": len,
     "keys": lambda d: list(d.keys()),
     "values": lambda d: list(d.values()),

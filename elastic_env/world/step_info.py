@@ -23,11 +23,6 @@ class StepInfo(dict[str, Any]):
         super().__init__(given)
         self._rest = rest
 
-    def complete(self) -> dict[str, Any]:
-        """A plain dictionary with everything."""
-        self._settle()
-        return dict(super().items())
-
     def _settle(self) -> None:
         if self._rest is not None:
             rest = self._rest
@@ -51,19 +46,9 @@ class StepInfo(dict[str, Any]):
         self._rest = None
         super().clear()
 
-    def copy(self) -> dict[str, Any]:
-        """A plain dictionary with everything."""
-        return self.complete()
-
-    def __or__(self, other: Any) -> Any:
-        return self.complete() | dict(other)
-
-    def __ror__(self, other: Any) -> Any:
-        return dict(other) | self.complete()
-
     def __eq__(self, other: object) -> bool:
-        theirs = other.complete() if isinstance(other, StepInfo) else other
-        return self.complete() == theirs
+        theirs = other.copy() if isinstance(other, StepInfo) else other
+        return self.copy() == theirs
 
     def __ne__(self, other: object) -> bool:
         return not self == other
@@ -71,7 +56,7 @@ class StepInfo(dict[str, Any]):
     __hash__ = None  # type: ignore[assignment]
 
     def __reduce_ex__(self, protocol: Any) -> Any:
-        return dict, (self.complete(),)
+        return dict, (self.copy(),)
 
 
 def _when_complete(name: str) -> Callable[..., Any]:
@@ -87,6 +72,7 @@ def _when_complete(name: str) -> Callable[..., Any]:
 
 
 _ALTERED = ("pop", "popitem", "setdefault", "__delitem__")
-_READ = ("get", "keys", "values", "items", "__iter__", "__len__", "__repr__")
-for _name in (*_ALTERED, *_READ):
+_READ = ("get", "keys", "values", "items", "copy")
+_BY_OPERATORS = ("__iter__", "__reversed__", "__len__", "__repr__", "__or__")
+for _name in (*_ALTERED, *_READ, *_BY_OPERATORS):
     setattr(StepInfo, _name, _when_complete(_name))
