@@ -71,7 +71,7 @@ def test_walking_in_place_has_the_footholds_under_the_hips(num_steps: int) -> No
     feet = stepped(num_steps)
     np.testing.assert_array_equal(feet.positions, np.tile(FEET, (num_steps + 1, 1, 1)))
     np.testing.assert_array_equal(feet.yaw, 0.0)
-    same = stepped(num_steps, step_width_m=ROBOT.foot_spacing)
+    same = stepped(num_steps, step_width_m=2.0 * Thormang().hip_half_spacing)
     np.testing.assert_array_equal(same.positions, feet.positions)
 
 

@@ -159,7 +159,7 @@ def test_a_longer_left_leg_lifts_the_left_side() -> None:
     """Roll is positive to the right: the left hip rises. It cannot tilt further than both feet
     on the ground do."""
     roll, pitch = walked("input_output", 1.6, 2)["leg_length.difference"][4:]
-    spacing = model_of(walker()).biped.foot_spacing
+    spacing = 2.0 * model_of(walker()).biped.hips[0, 1]
     assert 0.02 * 2e-3 / spacing < roll < 2e-3 / spacing
     assert abs(pitch) < 0.2 * abs(roll) + 1e-4
 
@@ -254,7 +254,7 @@ def test_the_force_difference_control_wants_the_shifted_loads() -> None:
 
     zmp = np.array([[0.0, shift]])
     found = (action(gain, zmp=zmp) - action(0.0, zmp=zmp)) - (action(gain) - action(0.0))
-    longer = 0.004 * gain * 2.0 * shift / biped.foot_spacing * biped.weight
+    longer = 0.004 * gain * 2.0 * shift / (2.0 * biped.hips[0, 1]) * biped.weight
     expected = action(0.0, leg_length=np.array([[longer]])) - action(0.0)
     assert np.abs(expected).max() > 1e-5
     np.testing.assert_allclose(found, expected, atol=1e-8, rtol=2e-3)

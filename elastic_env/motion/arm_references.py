@@ -56,9 +56,8 @@ class Workspace:
         joints: Names of the joints, in order.
         lowest, highest: Ranges of the joints, infinite where there is none, (n,) [rad].
         home: Angles about which the robot moves, (n,) [rad].
-        holds: Whether the servos hold poses at rest, from (..., n) [rad] to (...).
-        lack: Torque that the servos lack for that, over what they have, summed over the joints;
-            from (..., n) [rad] to (...) [1].
+        lack: Torque that the servos lack to hold poses at rest, over what they have, summed over
+            the joints; from (..., n) [rad] to (...) [1].
         end_effector: Where the tool is; None for a robot without one.
     """
 
@@ -66,7 +65,6 @@ class Workspace:
     lowest: Array
     highest: Array
     home: Array
-    holds: Any
     lack: Any
     end_effector: EndEffector | None
 
@@ -92,7 +90,7 @@ class Workspace:
         found = np.empty((0, n))
         for _ in range(_TRIES):
             drawn = generator.uniform(low, np.maximum(high, low), (count, n))
-            found = np.concatenate([found, drawn[self.holds(drawn)]])[:count]
+            found = np.concatenate([found, drawn[self.lack(drawn) == 0.0]])[:count]
             if len(found) == count:
                 return found
         raise WeakServosError(
@@ -106,7 +104,7 @@ class Workspace:
         stride = _STRIDE * np.maximum(high - low, 0.0)
         pose = self.home
         for _ in range(_ROUNDS):
-            if self.holds(pose):
+            if self.lack(pose) == 0.0:
                 return self._closer(pose)
             drawn = pose + stride * generator.standard_normal((_NEARBY, len(pose)))
             nearby = np.vstack([pose, np.clip(drawn, low, high)])
@@ -118,7 +116,7 @@ class Workspace:
         for joint, angle in enumerate(self.home):
             returned = pose.copy()
             returned[joint] = angle
-            if self.holds(returned):
+            if self.lack(returned) == 0.0:
                 pose = returned
         return pose
 

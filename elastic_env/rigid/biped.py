@@ -75,11 +75,6 @@ class Biped:
         return self.hips[:, :2]
 
     @property
-    def foot_spacing(self) -> float:
-        """Distance from the right one of them to the left one [m]."""
-        return float(self.hips[0, 1] - self.hips[1, 1])
-
-    @property
     def ankles(self) -> Array:
         """Ankles with the feet flat on their footholds, left first, (2, 3) [m]."""
         heights = np.full((2, 1), self.ankle_height)

@@ -22,7 +22,7 @@ from mujoco import MjSpec
 
 from elastic_env.core.config import Model
 from elastic_env.core.errors import ConfigurationError, require_known
-from elastic_env.core.signals import Array, BoolArray
+from elastic_env.core.signals import Array
 from elastic_env.joint.elasticity import ElasticJoint
 from elastic_env.joint.friction import passed_torque
 from elastic_env.joint.make_elastic import transform_hinges
@@ -234,9 +234,8 @@ class JointRobot:
         if self.end_effector is not None:
             tool = EndEffector(loaded, names, self.end_effector)
         lowest, highest = joint_ranges(true.rigid, names)
-        holds = partial(_holds, true, body)
         lack = partial(_lack, true, body)
-        workspace = Workspace(tuple(names), lowest, highest, home, holds, lack, tool)
+        workspace = Workspace(tuple(names), lowest, highest, home, lack, tool)
         return true, body, workspace
 
     def elastic(self, config: "JointRobotConfig") -> MjSpec:
@@ -377,14 +376,8 @@ def _carrying(spec: MjSpec, end_effector: str | None, mass: float) -> MjSpec:
     return spec
 
 
-def _holds(robot: RobotModel, body: RigidBody, q: Array) -> BoolArray:
-    """True if servos hold poses with a fifth of their torque to spare, (..., n) [rad] to (...)."""
-    needed = robot.largest_passed_torque(body.gravity_torque(q))
-    return np.all(needed < _SPARE * robot.largest_torque(np.zeros_like(q)), axis=-1)
-
-
 def _lack(robot: RobotModel, body: RigidBody, q: Array) -> Array:
-    """What servos lack to hold poses as `_holds` asks, over their torque; (..., n) to (...)."""
+    """Torque that servos lack to hold poses with a fifth to spare, over what they have; to (...)."""
     limits = robot.largest_torque(np.zeros_like(q))
     needed = robot.largest_passed_torque(body.gravity_torque(q))
     return np.maximum(needed / limits - _SPARE, 0.0).sum(axis=-1)

@@ -306,7 +306,7 @@ def read_targets(
         file, what="file of targets", row="row", most_rows=_MOST_POSES * 100, example=example
     )
     if names[0] == "time_s":
-        workspace = Workspace(tuple(joints), lowest, highest, start, None, None, None)
+        workspace = Workspace(tuple(joints), lowest, highest, start, None, None)
         path = Csv(file=str(file)).joint_plan(workspace, period_s).q
         require_in_range(str(file), joints, path, lowest, highest)
         return Trajectory(path)
