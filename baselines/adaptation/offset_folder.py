@@ -6,10 +6,10 @@ control period alone.
 """
 
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
-from pydantic import Field, field_validator
+from pydantic import AfterValidator, Field
 from safetensors.numpy import save
 
 from baselines.adaptation.iterative import LearningGains
@@ -25,12 +25,18 @@ _TENSOR = "offsets"
 _LARGEST = 1.0
 
 
+def _require_base(name: str) -> str:
+    if ":" in name or name == "iterative":
+        raise ValueError(f"the base must be a baseline without learning, got {name!r}")
+    return name
+
+
 class TableDescription(Model):
     """Content of `iterative.json`, about the table beside it."""
 
     robot: Title
     """Task of the environment, walker or testbed."""
-    base: Title
+    base: Annotated[Title, AfterValidator(_require_base)]
     """Name of the policy that the offsets are added to."""
     learning: LearningGains = LearningGains()
     signals: list[Title] = Field(min_length=1, max_length=MOST_ENTRIES)
@@ -43,13 +49,6 @@ class TableDescription(Model):
     """That it was learned in."""
     training: dict[str, Any] = {}
     """Seed of the robot, commit, versions."""
-
-    @field_validator("base")
-    @classmethod
-    def _base_is_a_name(cls, value: str) -> str:
-        if ":" in value or value == "iterative":
-            raise ValueError(f"the base must be a baseline without learning, got {value!r}")
-        return value
 
 
 def motion_of(env: Any) -> dict[str, Any]:

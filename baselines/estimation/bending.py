@@ -34,7 +34,6 @@ DISAGREEMENT_RAD = 0.002
 """Standard deviations before the first measurement, of ρ and c, and of a measurement."""
 
 _UNKNOWNS = 2  # ρ and c
-_SHAPE = (2, 2)  # legs, roll and pitch
 _FILTERS = tuple(f".{side}_{axis}" for side in "lr" for axis in ("roll", "pitch"))
 _PRIOR: Array = np.diag([MODEL_ERROR, OFFSET_RAD])[np.triu_indices(_UNKNOWNS)] ** 2
 """Upper triangle of the covariance before the first measurement."""

@@ -152,6 +152,7 @@ class Channels:
         signals: dict[str, Signal] = {}
         bounds: list[float] = []
         sources: list[str | None] = []
+        acted: list[Signal] = []
         self._columns: dict[str, slice] = {}
         for name in settings.acts_on:
             first = len(bounds)
@@ -164,14 +165,14 @@ class Channels:
                     signals.setdefault(source, column)
                 sources.append(source if bound > 0.0 else None)
             bounds += of_input
+            acted += columns
             self._columns[name] = slice(first, len(bounds))
         self.bounds = np.array(bounds)
-        acts_on = [named_inputs.input_signals(name, model) for name in settings.acts_on]
-        self.columns = tuple(signal for of_input in acts_on for signal in of_input)
+        self.columns = tuple(acted)
         order = {name: number for number, name in enumerate(signals)}
         self.source = np.array([order.get(source or "", 0) for source in sources])
-        named = [replace(signal, name=name) for name, signal in signals.items()]
-        self.signals = tuple(replace(signal, low=-1.0, high=1.0) for signal in named)
+        ends = {"low": -1.0, "high": 1.0}
+        self.signals = tuple(replace(own, name=name, **ends) for name, own in signals.items())
 
     def approach(self, values: Array, residual: Array, share: float) -> Array:
         """Values of all columns after a share of their way to a residual, (num_worlds, width).

@@ -1,8 +1,8 @@
 """How a residual acts and what it sees, and the content of `residual.json`."""
 
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal
 
-from pydantic import ConfigDict, Field, field_validator, model_validator
+from pydantic import AfterValidator, ConfigDict, Field
 
 from baselines.compensation.inputs import DEFLECTION, INPUTS
 from elastic_env.core.config import MOST_ENTRIES, Model, Title, quantity
@@ -54,8 +54,7 @@ class ResidualSettings(Model):
     """What a teacher sees of the true robot (`baselines.residual.true_robot`); none for a residual
     that a robot can play. For a walker in simulation."""
 
-    @model_validator(mode="after")
-    def _inputs_exist_within_their_bounds(self) -> Self:
+    def _check(self) -> None:
         require_known("input", self.acts_on, INPUTS)
         require_known("quantity that a teacher sees", self.privileged, TRUE_QUANTITIES)
         for name, bound in self.acts_on.items():
@@ -67,7 +66,6 @@ class ResidualSettings(Model):
                 raise ValueError(
                     f"the bound of {name} must be positive and below {limit}, got {quote(bound)}"
                 )
-        return self
 
     @property
     def bounds(self) -> dict[str, Bound]:
@@ -96,45 +94,6 @@ class Origin(Model):
     commit: Title | None = None
 
 
-class ResidualDescription(Model):
-    """Content of `residual.json`, about the weights beside it."""
-
-    robot: Title
-    """Task of the environment, walker or testbed."""
-    joints: list[Title] = Field(default=[], max_length=MOST_ENTRIES)
-    """Joints of the robot that it was trained on; none in folders from before they were written."""
-    base: Title
-    """Name of the base policy."""
-    base_options: dict[str, Any] = {}
-    settings: ResidualSettings = ResidualSettings()
-    activation: Literal["tanh", "relu"] = "tanh"
-    """Between the layers."""
-    output: Literal["clip", "tanh"] = "clip"
-    """How the last layer comes to [−1, 1]: clipped (PPO), or by tanh (SAC)."""
-    clip: float = quantity("1", 10.0, gt=0, le=1e6)
-    """Bound of normalised features, in standard deviations [1]."""
-    weights_sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")] | None = None
-    """Digest of the weights; None for those of folders from before it was written."""
-    training: dict[str, Any] = {}
-    """How it was trained: configuration, seed, versions, commit."""
-
-    @field_validator("base")
-    @classmethod
-    def _base_is_no_residual(cls, value: str) -> str:
-        return require_plain_base(value)
-
-    @field_validator("training")
-    @classmethod
-    def _origin_is_readable(cls, value: dict[str, Any]) -> dict[str, Any]:
-        Origin(**value)
-        return value
-
-    @property
-    def origin(self) -> Origin:
-        """How it was trained, as far as comparisons read it."""
-        return Origin(**self.training)
-
-
 def require_plain_base(name: str) -> str:
     """The name of a base policy.
 
@@ -150,3 +109,37 @@ def require_plain_base(name: str) -> str:
             "baseline, as a residual plays without code of its own"
         )
     return name
+
+
+def _require_origin(training: dict[str, Any]) -> dict[str, Any]:
+    """What says how a residual was trained, if comparisons can read it."""
+    Origin(**training)
+    return training
+
+
+class ResidualDescription(Model):
+    """Content of `residual.json`, about the weights beside it."""
+
+    robot: Title
+    """Task of the environment, walker or testbed."""
+    joints: list[Title] = Field(default=[], max_length=MOST_ENTRIES)
+    """Joints of the robot that it was trained on; none in folders from before they were written."""
+    base: Annotated[Title, AfterValidator(require_plain_base)]
+    """Name of the base policy."""
+    base_options: dict[str, Any] = {}
+    settings: ResidualSettings = ResidualSettings()
+    activation: Literal["tanh", "relu"] = "tanh"
+    """Between the layers."""
+    output: Literal["clip", "tanh"] = "clip"
+    """How the last layer comes to [−1, 1]: clipped (PPO), or by tanh (SAC)."""
+    clip: float = quantity("1", 10.0, gt=0, le=1e6)
+    """Bound of normalised features, in standard deviations [1]."""
+    weights_sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")] | None = None
+    """Digest of the weights; None for those of folders from before it was written."""
+    training: Annotated[dict[str, Any], AfterValidator(_require_origin)] = {}
+    """How it was trained: configuration, seed, versions, commit."""
+
+    @property
+    def origin(self) -> Origin:
+        """How it was trained, as far as comparisons read it."""
+        return Origin(**self.training)
