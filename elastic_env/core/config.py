@@ -149,6 +149,7 @@ Title = Annotated[_Text, Field(max_length=100)]
 Locator = Annotated[_Text, Field(max_length=1000)]
 """Text that may hold a path."""
 MOST_ENTRIES = 1000
+"""Entries of a list in a configuration."""
 
 
 def _each_once(values: list[Any]) -> list[Any]:
@@ -160,7 +161,6 @@ def _each_once(values: list[Any]) -> list[Any]:
 
 Once = AfterValidator(_each_once)
 """For a list in which nothing stands twice."""
-"""Entries of a list in a configuration."""
 _Entry = TypeVar("_Entry")
 Entries = Annotated[list[_Entry], Field(min_length=1, max_length=MOST_ENTRIES)]
 """A list of a configuration that must not be empty."""

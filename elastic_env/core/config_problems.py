@@ -12,9 +12,9 @@ from pydantic.fields import FieldInfo
 from elastic_env.core.errors import ConfigurationError, choices_listed, quote, readable
 
 ParameterPath = tuple[str | int, ...]
+"""Keys and numbers of entries that lead to a value."""
 Spelling = Callable[[ParameterPath], str]
 """How a parameter is written."""
-"""Keys and numbers of entries that lead to a value."""
 
 
 @dataclass(frozen=True)

@@ -377,7 +377,7 @@ def _carrying(spec: MjSpec, end_effector: str | None, mass: float) -> MjSpec:
 
 
 def _lack(robot: RobotModel, body: RigidBody, q: Array) -> Array:
-    """What servos lack to hold poses with a fifth to spare, over their torque, (..., n) to (...)."""
+    """What servos lack to hold poses (..., n) with a fifth to spare, over their torque, (...)."""
     limits = robot.largest_torque(np.zeros_like(q))
     needed = robot.largest_passed_torque(body.gravity_torque(q))
     return np.maximum(needed / limits - _SPARE, 0.0).sum(axis=-1)

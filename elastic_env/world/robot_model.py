@@ -264,6 +264,8 @@ def read_stiffness(value: Stiffness) -> "float | Array":
         path = Path(value)  # pyright: ignore[reportArgumentType]
     try:
         content = read_bounded(path, LARGEST_JSON)
+    except ConfigurationError:  # there is one, of a wrong kind or size
+        raise
     except (OSError, ValueError):
         needed = "stiffness must be a number [N·m/rad] or an identification file"
         raise ConfigurationError(f"{needed}, found no file {shorten(path)}") from None
