@@ -7,7 +7,8 @@ import copy
 import threading
 import xml.etree.ElementTree as ET
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -362,6 +363,20 @@ def _is_of_mesh(geom: mujoco.MjsGeom) -> bool:
     return geom.type == _MESH or bool(geom.meshname)
 
 
+@contextmanager
+def without_log_file(without_console: bool = False) -> Iterator[None]:
+    """Let MuJoCo write no MUJOCO_LOG.TXT into the folder of a user, and on request say nothing."""
+    before = mujoco.MjLogConfig.get()
+    silent = mujoco.MjLogConfig.get()
+    silent.logto_file = False
+    silent.logto_console &= not without_console
+    silent.set()
+    try:
+        yield
+    finally:
+        before.set()
+
+
 def from_mujoco(action: Callable[[], Result], name: str, verb: str) -> Result:
     """The result of an action of MuJoCo; its errors teach.
 
@@ -378,15 +393,9 @@ def from_mujoco(action: Callable[[], Result], name: str, verb: str) -> Result:
             errors.append(error)
 
     thread = threading.Thread(target=work, daemon=True)
-    before = mujoco.MjLogConfig.get()
-    silent = mujoco.MjLogConfig.get()
-    silent.logto_file = False  # no MUJOCO_LOG.TXT in the folder of a user
-    silent.set()
-    try:
+    with without_log_file():
         thread.start()
         thread.join()
-    finally:
-        before.set()
     if errors:
         problem = _with_cure(errors[0])
         raise ConfigurationError(f"MuJoCo cannot {verb} {name}: {problem}") from None

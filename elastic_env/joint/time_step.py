@@ -8,14 +8,13 @@ contacts, limits, dry friction and dead bands, which only hold a joint back.
 """
 
 import copy
-from collections.abc import Iterator
-from contextlib import contextmanager
 
 import mujoco
 import numpy as np
 
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
+from elastic_env.joint.model_file import without_log_file
 
 _ROOM = 1.1
 """By how much a physics step must be below the limit in the reference posture: inertias change
@@ -46,7 +45,7 @@ def spectral_radius(model: mujoco.MjModel, timestep_s: float) -> float:
     """
     linear = _without_constraints(model)
     linear.opt.timestep = timestep_s
-    with _without_messages():
+    with without_log_file(without_console=True):  # a step that explodes is an answer
         A = _transition(linear)
     if not np.isfinite(A).all():
         return float("inf")
@@ -119,19 +118,6 @@ def stable_timestep(model: mujoco.MjModel, control_period_s: float) -> float:
         return float(model.opt.timestep)
     steps = control_period_s * _ROOM / largest_stable_timestep(model)
     return control_period_s / int(np.ceil(steps - 1e-9))
-
-
-@contextmanager
-def _without_messages() -> Iterator[None]:
-    """Silence MuJoCo's warnings: here a step that explodes is an answer."""
-    before = mujoco.MjLogConfig.get()
-    silent = mujoco.MjLogConfig.get()
-    silent.logto_console = silent.logto_file = False
-    silent.set()
-    try:
-        yield
-    finally:
-        before.set()
 
 
 def _without_constraints(model: mujoco.MjModel) -> mujoco.MjModel:
