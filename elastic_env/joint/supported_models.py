@@ -122,6 +122,16 @@ def home_of(model: MjModel) -> Array:
     return model.key_qpos[0].copy() if model.nkey else model.qpos0.copy()
 
 
+def mass_matrix(model: MjModel, data: mujoco.MjData) -> Array:
+    """Inertia of all joints with armature at the positions of a state, (nv, nv) [kg·m²]."""
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
+    mujoco.mj_crb(model, data)
+    full = np.zeros((model.nv, model.nv))
+    mujoco.mj_fullM(model, data, full)
+    return full
+
+
 def require_robot(model: MjModel) -> None:
     """Refuse a model of which no joint can be commanded, whatever is said of its joints.
 
@@ -393,15 +403,11 @@ def _require_inertia(model: MjModel, joints: Sequence[str]) -> None:
     data = mujoco.MjData(model)
     at = [int(model.joint(name).id) for name in joints]
     dofs = model.jnt_dofadr[at]
-    full = np.zeros((model.nv, model.nv))
     smallest = []
     for offset in _POSES:
         data.qpos[:] = home_of(model)
         data.qpos[model.jnt_qposadr[at]] += offset
-        mujoco.mj_kinematics(model, data)
-        mujoco.mj_comPos(model, data)
-        mujoco.mj_crb(model, data)
-        mujoco.mj_fullM(model, data, full)
+        full = mass_matrix(model, data)
         links = full[np.ix_(dofs, dofs)] - np.diag(model.dof_armature[dofs])
         scale = np.sqrt(np.maximum(np.diag(links), np.finfo(np.float64).tiny))
         with np.errstate(over="ignore"):

@@ -24,7 +24,7 @@ from elastic_env.core.errors import missing_extra, require_known
 from elastic_env.core.signals import Array
 from elastic_env.joint.elasticity import ElasticJoint, Servo
 from elastic_env.joint.model_file import read_model
-from elastic_env.joint.supported_models import hinges_of
+from elastic_env.joint.supported_models import hinges_of, mass_matrix
 from elastic_env.rigid.rigid_body import RigidBody
 
 TIMESTEP_S = 1e-3
@@ -225,7 +225,4 @@ def _inertia(model: MjModel, pose: Array) -> Array:
     """Mass matrix without armature, (n, n) [kg·m²]."""
     data = mujoco.MjData(model)
     data.qpos[:] = pose
-    mujoco.mj_forward(model, data)
-    full = np.zeros((model.nv, model.nv))
-    mujoco.mj_fullM(model, data, full)
-    return full - np.diag(model.dof_armature)
+    return mass_matrix(model, data) - np.diag(model.dof_armature)

@@ -19,7 +19,7 @@ from elastic_env.joint.joint_settings import (
     read_joints,
 )
 from elastic_env.joint.model_servo import force_limit, position_servo, rotor_inertia
-from elastic_env.joint.supported_models import home_of
+from elastic_env.joint.supported_models import home_of, mass_matrix
 from elastic_env.rigid.rigid_body import RigidBody
 from elastic_env.rigid.tree.end_effector import outermost_body
 from elastic_env.world.robot_model import joint_ranges
@@ -163,14 +163,9 @@ def _inertias(model: MjModel, names: list[str], poses: Array) -> tuple[Array, Ar
     least = np.full(len(names), np.inf)
     most = np.zeros(len(names))
     together = np.zeros(len(names))
-    mass = np.empty((model.nv, model.nv))
     for pose in poses[:_MASS_POSES]:
         data.qpos[model.jnt_qposadr[at]] = pose
-        mujoco.mj_kinematics(model, data)
-        mujoco.mj_comPos(model, data)
-        mujoco.mj_crb(model, data)
-        mujoco.mj_fullM(model, data, mass)
-        links = mass[np.ix_(dofs, dofs)] - rotors
+        links = mass_matrix(model, data)[np.ix_(dofs, dofs)] - rotors
         least = np.minimum(least, 1.0 / np.diag(np.linalg.inv(links)))
         most = np.maximum(most, np.diag(links))
         together = np.maximum(together, np.abs(links).sum(axis=1))
