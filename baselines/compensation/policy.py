@@ -234,25 +234,12 @@ class Zero(BatchPolicy):
     reads_rates = False
 
     @override
-    def predict(
-        self,
-        observation: Array,
-        state: Any = None,
-        episode_start: Any = None,
-        deterministic: bool = True,
-        inputs: PolicyInputs = NO_INPUTS,
-    ) -> tuple[Any, None]:
-        """Zero offset, (..., n) [rad], whatever the observation holds."""
-        shape = (*observation.shape[:-1], self.view.num_joints)
-        return np.zeros(shape, dtype=np.float32), None
-
-    @override
     def begin(self, rows: Array) -> None:
         return None
 
     @override
     def act(self, rows: Array, memory: None, inputs: PolicyInputs) -> Step:
-        return self.predict(rows)
+        return np.zeros((len(rows), self.view.num_joints), dtype=np.float32), None
 
 
 class UserMemory(NamedTuple):
