@@ -98,12 +98,9 @@ def record_type(**fields: Any) -> np.dtype[Any]:
     """Type of the rows of a record array for kernels.
 
     Args:
-        **fields: Shape of each field of numbers, () for a number; bool for a truth value.
+        **fields: Shape of each field of numbers, () for a number.
     """
-    parts = [
-        (name, np.bool_) if shape is bool else (name, np.float64, shape)
-        for name, shape in fields.items()
-    ]
+    parts = [(name, np.float64, shape) for name, shape in fields.items()]
     return np.dtype((np.record, parts))
 
 

@@ -156,7 +156,8 @@ def plan_walk(gait: Gait, biped: Biped, control_period_s: float) -> WalkPlan:
         require_clear_feet(footholds, biped.sole_half_size)
     feet = _foot_paths(gait, timing, footholds, biped)
     zmp = gaits.zmp_reference(gait, timing, footholds)
-    standing, com_height = _standing(gait, biped, zmp[0], feet.at_start)
+    first = _Feet(feet.ankles[:1], feet.yaw[:1], feet.heading[:1])
+    standing, com_height = _standing(gait, biped, zmp[0], first)
     preview = PreviewConfig(
         com_height_m=com_height, period_s=control_period_s, gravity=biped.gravity
     )
@@ -288,11 +289,6 @@ class _Feet:
     ankles: Array
     yaw: Array
     heading: Array
-
-    @property
-    def at_start(self) -> "_Feet":
-        """The first row alone."""
-        return _Feet(self.ankles[:1], self.yaw[:1], self.heading[:1])
 
 
 def _foot_paths(gait: Gait, timing: Timing, holds: Footholds, biped: Biped) -> _Feet:

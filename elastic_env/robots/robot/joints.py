@@ -323,14 +323,13 @@ def _first(*values: float | None) -> float:
     return next(float(value) for value in values if value is not None)
 
 
-def drawn_poses(model: MjModel, joints: list[str], count: int = _POSES, seed: int = 0) -> Array:
-    """Poses within the ranges of the joints, or within half a turn about home, (count, n) [rad]."""
+def drawn_poses(model: MjModel, joints: list[str]) -> Array:
+    """Poses within the ranges of the joints, or within half a turn about home, (200, n) [rad]."""
     lowest, highest = joint_ranges(model, joints)
     home = home_of_joints(model, joints)
     lowest = np.maximum(lowest, home - np.pi / 2)
     highest = np.minimum(highest, home + np.pi / 2)
-    generator = np.random.default_rng(seed)
-    return generator.uniform(lowest, highest, (count, len(joints)))
+    return np.random.default_rng(0).uniform(lowest, highest, (_POSES, len(joints)))
 
 
 def home_of_joints(model: MjModel, joints: list[str]) -> Array:

@@ -172,7 +172,9 @@ class WalkerPicture(Picture):
         self._place("", drawn, robot)
         self._place(PLAN, planned, robot)
         for marker in (ZMP, ZMP_REFERENCE):
-            self._mark(marker, now[f"{marker}_x"], now[f"{marker}_y"])
+            x = now[f"{marker}_x"]
+            place = _BELOW_THE_FLOOR if np.isnan(x) else (x, now[f"{marker}_y"], 0.0)
+            self._data.mocap_pos[self._model.body(marker).mocapid[0]] = place
 
     def _caption(self, now: dict[str, float], world: int) -> list[str]:
         failures = [FELL] if self._task.has_fallen()[world] else []
@@ -192,11 +194,6 @@ class WalkerPicture(Picture):
         self._data.joint(f"{prefix}pelvis").qpos = _pose(posture.pelvis, posture.R)
         for joint, angle in zip(LEG_JOINTS, posture.joint_angles(robot), strict=True):
             self._data.joint(prefix + joint).qpos = angle
-
-    def _mark(self, marker: str, x: float, y: float) -> None:
-        """Lay a marker on the floor, or hide it where there is no such point."""
-        place = _BELOW_THE_FLOOR if np.isnan(x) else (x, y, 0.0)
-        self._data.mocap_pos[self._model.body(marker).mocapid[0]] = place
 
 
 def _pose(position: Array, R: Array) -> Array:
