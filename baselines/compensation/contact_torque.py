@@ -17,7 +17,12 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from baselines.compensation.policy import WalkView, record_row, record_rows
+from baselines.compensation.policy import (
+    ObservationView,
+    WalkView,
+    record_row,
+    record_rows,
+)
 from elastic_env.core.compiled import compiled, compiled_part
 from elastic_env.core.signals import Array
 from elastic_env.motion.walk_plan import WalkPlan
@@ -132,10 +137,9 @@ class PlannedTorque:
         table = model.observation_table
         plan = model.plan
         self._gravity = gravity
-        self._period_s = model.control_period_s
-        self._time = table.group("clock").start
+        self._view = ObservationView(model)
         rows = np.zeros((len(plan.q), len(table)))
-        rows[:, self._time] = plan.timing.time
+        rows[:, table.group("clock").start] = plan.timing.time
         rows[:, table.group("zmp_reference")] = plan.zmp
         rows[:, table.group("load_share")] = plan.share[:, None]
         self._of_motion = plan.torque - gravity.at(rows).gravity_torque(plan.q)
@@ -145,8 +149,7 @@ class PlannedTorque:
 
         `gravity` is the static one, if known.
         """
-        row = np.rint(rows[:, self._time] / self._period_s).astype(np.int64)
-        of_motion = self._of_motion.take(row, axis=0, mode="clip")
+        of_motion = self._of_motion.take(self._view.plan_row(rows), axis=0, mode="clip")
         return BoundPlannedTorque(of_motion, gravity or self._gravity.at(rows))
 
 

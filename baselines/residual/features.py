@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from baselines.compensation.policy import put_rows, select_rows
+from baselines.compensation.policy import ObservationView, put_rows, select_rows
 from baselines.estimation.bending import BendingObserver
 from baselines.estimation.ground_level import GroundLevel, GroundMemory
 from baselines.residual.correction import Corrected
@@ -303,14 +303,13 @@ def _phase(model: WalkerModel) -> _Instant:
     plan = model.plan
     psi = stride_angle(plan.timing, plan.gait.step_period_s)
     table = harmonics(psi, _PHASE_HARMONICS, is_odd=False)
-    time = model.observation_table.columns("clock.time")
+    view = ObservationView(model)
     orders = range(1, _PHASE_HARMONICS + 1)
     parts: Any = {f"{kind}_{k}": "same" for k in orders for kind in ("cosine", "sine")}
     signals = SignalGroup.of("phase", "1", "{part} of the phase of a step", parts, None).signals
 
     def observe(rows: Array) -> Array:
-        row = np.rint(rows[:, time][:, 0] / model.control_period_s).astype(np.int64)
-        return table.take(row, axis=0, mode="clip")
+        return table.take(view.plan_row(rows), axis=0, mode="clip")
 
     return _Instant(signals, observe)
 

@@ -206,7 +206,6 @@ class FootBalance(BatchPolicy):
         self._attitude = table.group("imu_attitude")
         self._rate = table.columns("imu_rate.x", "imu_rate.y")
         self._wrench = table.group("wrench")
-        self._clock = table.group("clock")
         acceleration, _ = derivatives(self._plan.com_dot, self._dt)
         upright = np.ones((len(acceleration), 1))
         self._local = self._plan.local
@@ -238,8 +237,7 @@ class FootBalance(BatchPolicy):
     def _adjustments(self, rows: Array, imu: Array, wrench: Array) -> Any:
         """Shifts of the feet, (num_worlds, 2, 3) [m], and turns about x and y [rad]."""
         gains = self._gains
-        periods = np.round(rows[:, self._clock][:, 0] / self._dt)
-        row = np.clip(periods.astype(np.int64) - 1, 0, self._plan.num_steps)
+        row = np.clip(self.view.plan_row(rows) - 1, 0, self._plan.num_steps)
         yaw = self._local.foot_yaw[row]
         wrench = wrench.reshape(-1, 2, 2, 3)
         force = turn(wrench[:, :, 0], yaw)
