@@ -41,6 +41,8 @@ _ON_JOINT = (_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
 _IMPLICITFAST = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
 # MuJoCo wants mass on every moving body; the rotor's inertia is its joint's armature
 _ROTOR_MASS = 1e-12
+_BLANK = MjSpec()
+"""Its defaults are MuJoCo's own: those of a model must not leak into rotor, spring and servo."""
 # MuJoCo's default friction constraint creeps: it loses nearly all of 5 N·m within 10 s at rest
 _FRICTION_SOLREF = (0.001, 1.0)
 _FRICTION_SOLIMP = (0.9999, 0.9999, 0.001, 0.5, 2.0)
@@ -246,13 +248,11 @@ def _rotor_body(spec: MjSpec, hinge: MjsJoint) -> MjsBody:
 
 
 def _add_rotor(spec: MjSpec, hinge: MjsJoint, joint: ElasticJoint) -> None:
-    """The rotor's hinge.
-
-    Every attribute is set: the model's default class must not leak into the rotor.
-    """
+    """The rotor's hinge."""
     # not enforced, so not converted; for actuators that inherit their range
     limits = _in_radians(hinge, hinge.range)
     rotor = _rotor_body(spec, hinge).add_joint(
+        _BLANK.default,
         name=motor_name(hinge.name),
         type=_HINGE,
         pos=hinge.pos,
@@ -264,16 +264,11 @@ def _add_rotor(spec: MjSpec, hinge: MjsJoint, joint: ElasticJoint) -> None:
         range=limits,
         actfrclimited=hinge.actfrclimited,
         actfrcrange=hinge.actfrcrange,
-        frictionloss=0.0,
         group=hinge.group,
     )
-    rotor.stiffness = rotor.damping = np.zeros(3)
-    rotor.springyield = 0.0
-    rotor.actgravcomp = False
     # of an attached model the unit may differ from the rotor's
     ref = float(_in_radians(hinge, hinge.ref))
     rotor.ref = rotor.springref = np.rad2deg(ref) if rotor.compiler.degree else ref
-    rotor.springdamper = np.zeros(2)
     hinge.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
     hinge.actfrcrange = np.zeros(2)
 
@@ -284,15 +279,8 @@ def _in_radians(hinge: MjsJoint, angle: Array) -> Array:
 
 
 def _add_spring(spec: MjSpec, name: str, joint: ElasticJoint) -> None:
-    """The spring as a tendon of length θ − q, without what a default class may hold."""
-    spring = spec.add_tendon(
-        name=spring_name(name),
-        limited=mujoco.mjtLimited.mjLIMITED_FALSE,
-        frictionloss=0.0,
-        armature=0.0,
-    )
-    spring.springyield = 0.0
-    spring.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
+    """The spring as a tendon of length θ − q."""
+    spring = spec.add_tendon(_BLANK.default, name=spring_name(name))
     spring.wrap_joint(motor_name(name), 1.0)
     spring.wrap_joint(name, -1.0)
     spring.stiffness = np.array([joint.stiffness, 0.0, 0.0])
@@ -355,17 +343,7 @@ def _redirect_sensors(spec: MjSpec, actuator: str, joint: str, has_servo: bool) 
 
 
 def _add_servo(spec: MjSpec, name: str, target: str, servo: Servo) -> None:
-    actuator = spec.add_actuator(name=name, target=target, trntype=_JOINT)
-    actuator.damping = np.zeros(3)
-    actuator.armature = 0.0
-    actuator.delay = 0.0
-    actuator.nsample = 0
-    actuator.actlimited = mujoco.mjtLimited.mjLIMITED_FALSE
-    actuator.actrange = np.zeros(2)
-    actuator.actearly = False
-    actuator.inheritrange = 0.0
-    actuator.ctrlrange = np.zeros(2)
-    actuator.cranklength = 0.0
+    actuator = spec.add_actuator(_BLANK.default, name=name, target=target, trntype=_JOINT)
     if servo.motor is None:
         actuator.set_to_pid(
             kp=servo.position_gain,
@@ -376,8 +354,6 @@ def _add_servo(spec: MjSpec, name: str, target: str, servo: Servo) -> None:
         )
     else:
         _set_to_motor(actuator, servo, servo.motor)
-    actuator.gear = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0])
-    actuator.ctrllimited = mujoco.mjtLimited.mjLIMITED_FALSE
     actuator.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE
     actuator.forcerange = np.array([-servo.torque_limit, servo.torque_limit])
 
