@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from elastic_env.core.signals import Array
-from elastic_env.rigid.leg_chains import LegChains
+from elastic_env.rigid.leg_chains import LegChains, LegTorque
 
 
 def foot_frames(chains: LegChains, q: Array) -> tuple[Array, Array]:
@@ -24,7 +24,8 @@ def torque_of(chains: LegChains, q: Array, gravity: Array | float = 0.0, **loads
 
 def gradient_of(chains: LegChains, q: Array, gravity: Array | float = 0.0, **loads: Any) -> Array:
     """Gradients of the legs of one posture, (L, J, J)."""
-    gradient = chains.gradient(chains.loads(1, gravity, **loads), q.reshape(1, -1))[0]
+    legs = LegTorque(chains, chains.loads(1, gravity, **loads))
+    gradient = legs.gravity_gradient(q.reshape(1, -1))[0]
     J = q.shape[1]
     return np.stack([gradient[i : i + J, i : i + J] for i in range(0, q.size, J)])
 

@@ -10,7 +10,7 @@ import pytest
 
 from elastic_env.core.signals import Array
 from elastic_env.rigid.floating_body import FloatingBody
-from elastic_env.rigid.leg_chains import LegChains
+from elastic_env.rigid.leg_chains import LegChains, LegTorque
 from elastic_env.rigid.tree import kernels
 from elastic_env.robots.thormang.model import LEG_JOINTS, Thormang, biped
 from tests.legs import foot_frames, gradient_of, holding_torque, torque_of
@@ -347,9 +347,9 @@ def test_a_row_of_a_batch_is_the_row_alone_bit_for_bit(rows: int) -> None:
             *chains.com_and_feet(q[part], np.array([0.1, -0.2, 0.3]), gravity[part, :2]),
             *chains.sole_tilts(q[part], gravity[part, :2], q[part]),
             *(chains.torque(loads, q[part]) for loads in (weights, wrenches)),
-            *(chains.gradient(loads, q[part]) for loads in (weights, wrenches)),
-            chains.solve(weights, q[part], stiffness)[0],
-            chains.solve(wrenches, q[part], stiffness, q[part])[0],
+            *(LegTorque(chains, own).gravity_gradient(q[part]) for own in (weights, wrenches)),
+            LegTorque(chains, weights).solve(q[part], stiffness),
+            LegTorque(chains, wrenches).solve(q[part], stiffness, q[part]),
         ]
 
     whole = everything(slice(rows))
@@ -369,9 +369,10 @@ def test_a_solution_solves_the_matrix_equation_of_each_leg() -> None:
     )
     stiffness = generator.uniform(50.0, 1500.0, 12)
     for torque in (None, generator.normal(0.0, 30.0, (5, 12))):
-        x, _ = ROBOT.chains.solve(loads, q, stiffness, torque)
-        A = np.diag(stiffness) + ROBOT.chains.gradient(loads, q)
-        expected = ROBOT.chains.torque(loads, q) if torque is None else torque
+        legs = LegTorque(ROBOT.chains, loads)
+        x = legs.solve(q, stiffness, torque)
+        A = np.diag(stiffness) + legs.gravity_gradient(q)
+        expected = legs.gravity_torque(q) if torque is None else torque
         np.testing.assert_allclose((A @ x[..., None])[..., 0], expected, rtol=0.0, atol=1e-9)
 
 
@@ -379,6 +380,7 @@ def test_one_gravity_serves_a_batch() -> None:
     """Catches a gravity that is needed for each world although it is the same in all of them."""
     q = np.random.default_rng(7).normal(size=(4, 12))
     gravity = np.array([0.1, 0.2, -9.8])
-    one, each = (ROBOT.chains.loads(count, gravity) for count in (1, 4))
-    for of in (ROBOT.chains.torque, ROBOT.chains.gradient):
-        np.testing.assert_array_equal(of(one, q), of(each, q))
+    loads = (ROBOT.chains.loads(count, gravity) for count in (1, 4))
+    one, each = (LegTorque(ROBOT.chains, own) for own in loads)
+    np.testing.assert_array_equal(one.gravity_torque(q), each.gravity_torque(q))
+    np.testing.assert_array_equal(one.gravity_gradient(q), each.gravity_gradient(q))

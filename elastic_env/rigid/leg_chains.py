@@ -19,6 +19,7 @@ from elastic_env.rigid.tree.links import Tree
 _ANKLE: Array = np.zeros(3)
 _OF_PELVIS: Array = np.empty((0, 2))
 """No attitudes: the level frame is that of the pelvis."""
+_NO_TORQUE: Array = np.empty((0, 0))
 
 
 class LegChains:
@@ -56,7 +57,6 @@ class LegChains:
         self.loads_type = kernels.loads_type(len(legs))
         self.links = tree.links
         self._legs = len(legs)
-        self._no_torque = np.empty((0, len(joints)))
 
     def center_of_mass(self, q: Array) -> Array:
         """Center of mass of the robot in the pelvis frame, (rows, n) [rad] to (rows, 3) [m]."""
@@ -131,32 +131,6 @@ class LegChains:
         kernels.gravity_torques(self.links, loads, _dense(q), torque)
         return torque
 
-    def gradient(self, loads: Any, q: Array) -> Array:
-        """∂τ/∂q of `torque`, (rows, n, n) [N·m/rad]; symmetric without a wrench."""
-        gradient = np.empty((*q.shape, q.shape[1]))
-        kernels.gravity_gradients(self.links, loads, _dense(q), gradient)
-        return gradient
-
-    def solve(
-        self, loads: Any, q: Array, stiffness: Array, torque: Array | None = None
-    ) -> tuple[Array, bool]:
-        """(K + ∂τ/∂q)⁻¹ τ, leg by leg.
-
-        Args:
-            loads: (rows,).
-            q: (rows, n) [rad].
-            stiffness: K, (n,) [N·m/rad].
-            torque: τ, (rows, n) [N·m]; None for `torque`.
-
-        Returns:
-            The deflection, (rows, n) [rad], and whether it is below half a turn everywhere. One
-            beyond is none, and the matrix may be singular.
-        """
-        x = np.empty(q.shape)
-        own = self._no_torque if torque is None else _dense(torque)
-        is_small = kernels.solutions(self.links, loads, _dense(q), stiffness, own, x)
-        return x, is_small
-
 
 class LegTorque(NamedTuple):
     """Torques of legs under loads that go with any posture, (num_worlds, n)."""
@@ -174,7 +148,9 @@ class LegTorque(NamedTuple):
 
         It is not symmetric under a wrench, which turns with its foot.
         """
-        return self.chains.gradient(self.loads, q)
+        gradient = np.empty((*q.shape, q.shape[1]))
+        kernels.gravity_gradients(self.chains.links, self.loads, _dense(q), gradient)
+        return gradient
 
     def solve(self, q: Array, stiffness: Array, torque: Array | None = None) -> Array:
         """(K + ∂τ_g/∂q)⁻¹ τ, leg by leg.
@@ -190,8 +166,10 @@ class LegTorque(NamedTuple):
         Raises:
             ElasticError: The matrix is singular.
         """
-        x, is_small = self.chains.solve(self.loads, q, stiffness, torque)
-        if not is_small:
+        x = np.empty(q.shape)
+        own = _NO_TORQUE if torque is None else _dense(torque)
+        links = self.chains.links
+        if not kernels.solutions(links, self.loads, _dense(q), stiffness, own, x):
             torque = self.gravity_torque(q) if torque is None else torque
             # says so if it is singular
             K = np.broadcast_to(stiffness, q.shape)
