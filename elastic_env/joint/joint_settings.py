@@ -149,7 +149,7 @@ def read_joints(
         ConfigurationError: No file or mapping, a name or pattern of no joint, or a value that
             cannot be.
     """
-    mapping = _mapping(given)
+    mapping = joint_mapping(given)
     for key, value in mapping.items():
         known = [*hinges, *others] if _is(value, HELD) else hinges
         if not isinstance(key, str) or not any(_fits(name, key) for name in known):
@@ -176,7 +176,12 @@ def _is(value: Any, word: str) -> bool:
     return isinstance(value, str) and value == word
 
 
-def _mapping(given: GivenJoints) -> Mapping[str, Any]:
+def joint_mapping(given: GivenJoints) -> Mapping[str, Any]:
+    """The mapping that is given, or that a file holds.
+
+    Raises:
+        ConfigurationError: It is neither, or the file holds none.
+    """
     if isinstance(given, Mapping):
         return given
     if not isinstance(given, str | Path):

@@ -218,14 +218,12 @@ def _require_model(found: ModelText) -> None:
         if key.startswith("xmlns:") and _XACRO in value
     }
     for element in root.iter():
-        prefix = element.tag.partition(":")[0] if ":" in element.tag else ""
-        prefixed = [key for key in element.attrib if ":" in key]
-        found_keys = [key for key in prefixed if key.partition(":")[0] in aliases]
-        if prefix in aliases or found_keys:
-            is_tag = prefix in aliases
-            what = f"<{element.tag}>" if is_tag else f"the attribute {found_keys[0]}"
-            problem = f"{name} is a file of xacro, it has {quote(what)[1:-1]}"
-            raise ConfigurationError(f"{problem}; {_EXPAND}")
+        for key in (element.tag, *element.attrib):
+            prefix, colon, _ = key.partition(":")
+            if colon and prefix in aliases:
+                what = f"<{key}>" if key == element.tag else f"the attribute {key}"
+                problem = f"{name} is a file of xacro, it has {quote(what)[1:-1]}"
+                raise ConfigurationError(f"{problem}; {_EXPAND}")
     if root.tag not in _KINDS:
         raise ConfigurationError(
             f"the root of {name} must be <mujoco> or <robot>, got {quote(root.tag)}; {_FILE}"

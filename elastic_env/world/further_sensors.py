@@ -167,10 +167,12 @@ class FurtherSensors:
         if self._noise is None:
             return
         drawn = self._noise.next(worlds)
-        shown = [
-            self._shown(sensor, sensor.truth(truth) + self._offset[name], drawn[name])
-            for name, sensor in self._sensors.items()
-        ]
+        shown = []
+        for name, sensor in self._sensors.items():
+            value = sensor.truth(truth) + self._offset[name]
+            error = self._scale * sensor.noise * drawn[name]
+            counts = self._count_rad
+            shown.append(quantise(value, counts) if sensor.is_encoder else value + error)
         self._before = self._now
         self._now = np.where(worlds[:, None], np.hstack(shown), self._now)
 
@@ -180,8 +182,3 @@ class FurtherSensors:
         In worlds whose measurements are delayed they are one control step old.
         """
         return np.where(is_delayed[:, None], self._before, self._now)
-
-    def _shown(self, sensor: Sensor, value: Array, drawn: Array) -> Array:
-        if sensor.is_encoder:
-            return quantise(value, self._count_rad)
-        return value + self._scale * sensor.noise * drawn

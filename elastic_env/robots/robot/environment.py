@@ -11,11 +11,16 @@ from typing import Any, Literal
 
 from mujoco import MjModel
 
-from elastic_env.core.config import read_mapping
-from elastic_env.core.errors import ConfigurationError, quote, require_known
+from elastic_env.core.errors import ConfigurationError, require_known
 from elastic_env.joint import supported_models as supported
 from elastic_env.joint.held_joints import hold_other_joints
-from elastic_env.joint.joint_settings import HELD, GivenJoints, JointSettings, key_of
+from elastic_env.joint.joint_settings import (
+    HELD,
+    GivenJoints,
+    JointSettings,
+    joint_mapping,
+    key_of,
+)
 from elastic_env.joint.model_file import GivenModel, compiled_spec
 from elastic_env.joint.time_step import stable_timestep
 from elastic_env.motion.arm_references import AnyArmReference
@@ -157,10 +162,7 @@ def joint_robot(
 def _elastic_hinges(model: MjModel, joints: GivenJoints) -> dict[str, JointSettings]:
     """Settings of the elastic hinges: of those that a pattern fits all but coupled fingers."""
     hinges = supported.hinges_of(model)
-    if not isinstance(joints, Mapping | str | Path):
-        kinds = "a YAML file or a mapping of joints by name"
-        raise ConfigurationError(f"joints must be {kinds}, got {quote(joints)}")
-    given = joints if isinstance(joints, Mapping) else read_mapping(Path(joints))
+    given = joint_mapping(joints)
     names = [model.joint(j).name for j in range(model.njnt)]
     others = [name for name in names if name not in hinges]
     settings = own_joints.elastic_settings(given, hinges, others)
