@@ -2,6 +2,7 @@
 that are not ours."""
 
 from pathlib import Path
+from typing import Any
 
 import gymnasium
 import mujoco
@@ -883,6 +884,13 @@ def test_an_unknown_hinge_lists_the_hinges() -> None:
         make_elastic(spec, {"lft": FOREIGN})
     with pytest.raises(ConfigurationError, match="unknown hinge 'root'"):
         make_elastic(spec, {"root": FOREIGN})
+
+
+@pytest.mark.parametrize("joints", [5, ["left"], {"left": 1000.0}, {"left": {"stiffness": 1000.0}}])
+def test_what_is_no_mapping_of_joints_says_so(joints: Any) -> None:
+    """Catches an AttributeError for a stiffness in the place of a joint."""
+    with pytest.raises(ConfigurationError, match="mapping from names of hinges to ElasticJoint, g"):
+        make_elastic(mujoco.MjSpec.from_string(ROVER), joints)
 
 
 def test_an_unknown_form_or_rule_lists_the_choices() -> None:

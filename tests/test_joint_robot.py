@@ -230,6 +230,11 @@ def test_what_cannot_be_says_why(arguments: dict[str, Any], message: str) -> Non
         ({"load_kg": "heavy"}, "load_kg must be a valid number, got 'heavy'"),
         ({"end_effector": ["tip"]}, r"end_effector must be text, got \['tip'\]"),
         ({"imu": 5}, "imu must be text, got 5"),
+        ({"load_kg": 2.0}, "unknown site or body for end_effector None; choose one of: "),
+        (
+            {"load_kg": 2.0, "end_effector": "nose"},
+            "unknown site or body for end_effector 'nose'; choose one of: ",
+        ),
     ],
 )
 def test_values_of_a_robot_that_cannot_be_say_why(options: dict[str, Any], message: str) -> None:

@@ -20,7 +20,7 @@ import mujoco
 import numpy as np
 from mujoco import MjsActuator, MjsBody, MjsJoint, MjSpec
 
-from elastic_env.core.errors import ConfigurationError, require_known
+from elastic_env.core.errors import ConfigurationError, quote, require_known
 from elastic_env.core.signals import Array
 from elastic_env.joint import joint_names
 from elastic_env.joint.elasticity import ElasticJoint, Servo
@@ -97,6 +97,10 @@ def make_elastic(
         UserWarning: The integrator was changed, a servo is left out because the hinge keeps its
             actuators, or friction changes with load or speed, which needs a call before every step.
     """
+    are_joints = isinstance(joints, Mapping)
+    if not are_joints or not all(isinstance(own, ElasticJoint) for own in joints.values()):
+        needed = "a mapping from names of hinges to ElasticJoint"
+        raise ConfigurationError(f"joints must be {needed}, got {quote(joints)}")
     require_few(joints)
     read = read_model(spec)
     require_hinge(read.model)

@@ -359,15 +359,16 @@ def _scaled(spec: MjSpec, body: int, scale: float) -> MjSpec:
     return spec
 
 
-def _carrying(spec: MjSpec, end_effector: str | None, mass: float) -> MjSpec:
+def _carrying(spec: MjSpec, end_effector: Any, mass: float) -> MjSpec:
     """A model with one point mass more at its end effector."""
+    names = [part.name for part in (*spec.sites, *spec.bodies[1:]) if part.name]
+    require_known("site or body for end_effector", [end_effector], names)
     site = next((site for site in spec.sites if site.name == end_effector), None)
-    carrier = spec.body(end_effector) if site is None else site.parent
-    if carrier is None or not mass > 0.0:
+    carrier: Any = spec.body(end_effector) if site is None else site.parent
+    if not mass > 0.0:
         raise ConfigurationError(
-            f"the load at the end effector {end_effector!r} must be > 0 kg, got {mass:g} kg; name"
-            " an end effector, and give load_kg and the scenario's pendulum_mass_scale - 1 the"
-            " same sign"
+            f"the load at the end effector {end_effector!r} must be > 0 kg, got {mass:g} kg; give"
+            " load_kg and the scenario's pendulum_mass_scale - 1 the same sign"
         )
     load = carrier.add_body(pos=np.zeros(3) if site is None else site.pos, mass=mass)
     load.ipos = [0.0] * 3
