@@ -177,6 +177,4 @@ def _assumed(env: Any, options: PolicyOptions) -> RobotModel:
     model: RobotModel = env.unwrapped.assumed_model
     if options.stiffness is not None:
         model = model.with_stiffness(read_stiffness(options.stiffness))
-    if options.stiffness_scale == 1.0:
-        return model
     return model.with_stiffness(options.stiffness_scale * model.stiffness)

@@ -140,7 +140,7 @@ class LegEstimator(Estimator):
         """Values of the observer, the mean excess load, (num_worlds, 1) [1], and new memory."""
         bending = None if self.sensors is None else self.sensors.deflection(rows)
         seen, observer = self.observer.observe(rows, memory.observer, bending)
-        load, loads = mean_load(memory.loads, seen[:, [_LOAD]], ASSUMED_LOADS)
+        load, loads = mean_load(memory.loads, seen[:, [_LOAD]])
         return seen, load, EstimatorMemory(loads, observer)
 
     @override
@@ -256,13 +256,12 @@ def make_estimator(model: RobotModel, sensors: DeflectionSensors) -> Estimator:
     return LegEncoderEstimator(model, sensors)
 
 
-def mean_load(memory: Array, excess: Array, prior: float = ASSUMED_LOADS) -> tuple[Array, Array]:
+def mean_load(memory: Array, excess: Array) -> tuple[Array, Array]:
     """Mean excess load of the feet, (num_worlds, 1) [1], and the new number and sum.
 
     Args:
         memory: Number and sum, (num_worlds, 2).
         excess: Measured over assumed load less one, (num_worlds, 1) [1].
-        prior: Number of measurements that the assumed load counts for.
     """
     memory = memory + np.hstack([np.ones_like(excess), excess])
-    return memory[:, 1:] / (prior + memory[:, :1]), memory
+    return memory[:, 1:] / (ASSUMED_LOADS + memory[:, :1]), memory

@@ -130,12 +130,10 @@ def hip_offsets(turn: Array) -> Array:
     """Offsets of the joints, (n, 12) [rad], that turn a standing pelvis by −roll and −pitch.
 
     Args:
-        turn: Roll and pitch of both hips, (n, 2), or of either, (n, 2, 2) [rad].
+        turn: Roll and pitch of both hips, (n, 2) [rad].
     """
     offsets = np.zeros((len(turn), 2, 6))
-    of_legs = turn if turn.ndim == 3 else turn[:, None]
-    offsets[:, :, _HIP_ROLL] = of_legs[..., 0]
-    offsets[:, :, _HIP_PITCH] = of_legs[..., 1]
+    offsets[:, :, [_HIP_ROLL, _HIP_PITCH]] = turn[:, None]
     return offsets.reshape(len(turn), 12)
 
 

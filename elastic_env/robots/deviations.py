@@ -1,7 +1,8 @@
 """Deviations of joints from their reference, as pictures of fixed robots draw them: enlarged."""
 
-from collections.abc import Mapping
 from typing import Any
+
+from elastic_env.rendering.picture import Picture
 
 WIDTH = 640
 HEIGHT = 480
@@ -18,11 +19,13 @@ def enlarge_deviation(angle: Any, reference: Any, factor: float = ENLARGEMENT) -
     return reference + factor * (angle - reference)
 
 
-def deviation_caption(now: Mapping[str, float]) -> list[str]:
-    """Lines of text over the picture of a robot with these signals."""
-    deflection = 1e3 * now["deflection"]
-    link_error = 1e3 * now["link_error"]
-    return [
-        f"t = {now['time_s']:6.2f} s     deviations from the reference drawn x {ENLARGEMENT:g}",
-        f"deflection {deflection:+7.2f} mrad     link error {link_error:+7.2f} mrad",
-    ]
+class DeviationPicture(Picture):
+    """A picture of a robot on a fixed base that says by how much its deviations are enlarged."""
+
+    def _caption(self, now: dict[str, float], world: int) -> list[str]:  # noqa: ARG002
+        deflection = 1e3 * now["deflection"]
+        link_error = 1e3 * now["link_error"]
+        return [
+            f"t = {now['time_s']:6.2f} s     deviations from the reference drawn x {ENLARGEMENT:g}",
+            f"deflection {deflection:+7.2f} mrad     link error {link_error:+7.2f} mrad",
+        ]

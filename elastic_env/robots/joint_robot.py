@@ -31,7 +31,7 @@ from elastic_env.motion.arm_references import AnyArmReference, ArmReference, Wor
 from elastic_env.motion.references import Multisine
 from elastic_env.motion.trajectory import Motion
 from elastic_env.registration import Robot, as_model
-from elastic_env.rendering.picture import CAMERA, Picture, set_stage
+from elastic_env.rendering.picture import CAMERA, set_stage
 from elastic_env.rendering.side_by_side import Alone, Sides
 from elastic_env.rigid.rigid_body import RigidBody
 from elastic_env.rigid.tree.end_effector import EndEffector
@@ -295,7 +295,7 @@ class JointRobotConfig(JointConfig):
         return self.robot.plant(self)
 
 
-class JointPicture(Picture):
+class JointPicture(deviations.DeviationPicture):
     """The robot with its deviations enlarged, and the reference as a translucent robot.
 
     Args:
@@ -342,9 +342,6 @@ class JointPicture(Picture):
         for name, angle, reference in zip(self._joints, drawn, q_ref, strict=True):
             self._data.joint(name).qpos = angle
             self._data.joint(_REFERENCE + name).qpos = reference
-
-    def _caption(self, now: dict[str, float], world: int) -> list[str]:  # noqa: ARG002
-        return deviations.deviation_caption(now)
 
 
 def _scaled(spec: MjSpec, body: int, scale: float) -> MjSpec:

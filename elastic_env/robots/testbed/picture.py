@@ -9,10 +9,10 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from elastic_env.rendering.picture import Picture, set_stage
+from elastic_env.rendering.picture import set_stage
 from elastic_env.rendering.side_by_side import Alone, Sides
 from elastic_env.robots import deviations
-from elastic_env.robots.deviations import enlarge_deviation
+from elastic_env.robots.deviations import DeviationPicture, enlarge_deviation
 from elastic_env.robots.testbed.model import Pendulum
 
 _SHAPES = Path(__file__).with_suffix(".xml").read_text(encoding="utf-8")
@@ -20,7 +20,7 @@ _OF_LEGEND = {"rotor": "rotor_disc", "link": "link_bob"}
 """Words of the legend, and the shapes that have their colours."""
 
 
-class TestbedPicture(Picture):
+class TestbedPicture(DeviationPicture):
     """The testbed of Fig. 4: housing, rotor pointer, pendulum, and a translucent reference."""
 
     __test__ = False
@@ -55,9 +55,6 @@ class TestbedPicture(Picture):
         self._data.joint("reference").qpos = reference
         self._data.joint("link").qpos = enlarge_deviation(link, reference)
         self._data.joint("rotor").qpos = enlarge_deviation(rotor, reference)
-
-    def _caption(self, now: dict[str, float], world: int) -> list[str]:  # noqa: ARG002
-        return deviations.deviation_caption(now)
 
 
 def _display_spec(pendulum: Pendulum) -> mujoco.MjSpec:
