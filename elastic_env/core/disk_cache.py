@@ -83,7 +83,8 @@ class DiskCache:
             return
         try:
             file.parent.mkdir(parents=True, exist_ok=True)
-            write_whole(file, _sealed(key, numbers))
+            content = np.ascontiguousarray(numbers, dtype=_NUMBER).tobytes()
+            write_whole(file, hashlib.sha256(key.encode() + content).digest() + content)
             self._prune(file.parent)
         except OSError as error:
             _LOG.info("%s is not kept: %s", file, error)
@@ -111,11 +112,6 @@ def key_of(parts: Iterable[bytes | str]) -> str:
         found.update(f"{len(content)} ".encode())
         found.update(content)
     return found.hexdigest()
-
-
-def _sealed(key: str, numbers: Array) -> bytes:
-    content = np.ascontiguousarray(numbers, dtype=_NUMBER).tobytes()
-    return hashlib.sha256(key.encode() + content).digest() + content
 
 
 def _unsealed(key: str, sealed: bytes) -> Array | None:

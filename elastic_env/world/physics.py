@@ -124,7 +124,17 @@ class Worlds(Simulation):
             self._rub(self._friction)
             self._step(1)
 
+    @override
+    def refresh(self, worlds: BoolArray) -> None:
+        if worlds.any():
+            if self._friction is not None:
+                self._rub(self._friction)
+            self._forward(worlds)
+
     def _step(self, num_substeps: int) -> None:
+        raise NotImplementedError
+
+    def _forward(self, worlds: BoolArray) -> None:
         raise NotImplementedError
 
     def _field(self, name: str) -> Array:
@@ -224,11 +234,8 @@ class SingleWorld(Worlds):
             mujoco.mj_resetData(self.model, self._data)
 
     @override
-    def refresh(self, worlds: BoolArray) -> None:
-        if worlds[0]:
-            if self._friction is not None:
-                self._rub(self._friction)
-            mujoco.mj_forward(self.model, self._data)
+    def _forward(self, worlds: BoolArray) -> None:
+        mujoco.mj_forward(self.model, self._data)
 
 
 class ManyWorlds(Worlds):
@@ -328,11 +335,8 @@ class ManyWorlds(Worlds):
             self._ready().reset(worlds, stage=int(mujoco.mjtStage.mjSTAGE_NONE))
 
     @override
-    def refresh(self, worlds: BoolArray) -> None:
-        if worlds.any():
-            if self._friction is not None:
-                self._rub(self._friction)
-            self._ready().forward(worlds)
+    def _forward(self, worlds: BoolArray) -> None:
+        self._ready().forward(worlds)
 
 
 def simulate(model: MjModel, num_worlds: int, num_threads: int = 0) -> Simulation:

@@ -184,11 +184,7 @@ class WarpWorlds(Worlds):
         self._counts[worlds] = 0
 
     @override
-    def refresh(self, worlds: BoolArray) -> None:
-        if not worlds.any():
-            return
-        if self._friction is not None:
-            self._rub(self._friction)
+    def _forward(self, worlds: BoolArray) -> None:
         self._send()
         with warp.ScopedDevice(self._device):
             mujoco_warp.forward(self._model, self._data)
