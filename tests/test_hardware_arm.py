@@ -226,11 +226,15 @@ def test_a_turned_joint_is_found_by_its_load() -> None:
     weighed = [live.weigh(arm, joint, 0.08) for joint in range(6)]
     known = KnownArm(OPTIONS, JOINTS)
     with pytest.raises(HardwareError, match=r"'elbow_flex' holds .*write direction: -1 for it"):
-        command.require_signs(arm.servos, weighed, known.links.gravity_torque, known.joint_settings)
+        command.require_signs(
+            arm.servos, weighed, known.links.gravity_torque, known.compensator.settings
+        )
     right = VirtualArm(emulated())
     arm = begun(right, compensator())
     weighed = [live.weigh(arm, joint, 0.08) for joint in range(6)]
-    command.require_signs(arm.servos, weighed, known.links.gravity_torque, known.joint_settings)
+    command.require_signs(
+        arm.servos, weighed, known.links.gravity_torque, known.compensator.settings
+    )
     assert weighed[1].gain == pytest.approx(11.95, rel=0.1)
     assert all(0.5 < own.moved < 1.0 for own in weighed)
 
@@ -280,6 +284,34 @@ def test_a_wrong_zero_shows_in_the_loads(own: str, tmp_path: Path) -> None:
     assert "zero_rad" not in said[0]
     assert "light: its load does not tell the sign" in said[0]
     assert "look at zero_rad" in said[1]
+
+
+@pytest.mark.filterwarnings("ignore:.*taken for rigid")
+def test_a_joint_that_the_file_leaves_out_is_checked_as_a_rigid_one(tmp_path: Path) -> None:
+    """Catches a KeyError in the midst of the check, where the compensator has only warned."""
+    joints_file = tmp_path / "joints.yaml"
+    joints_file.write_text(JOINTS.read_text().replace('"*"', '"[!g]*"'))
+    text = io.StringIO()
+    arm = begun(VirtualArm(emulated()), compensator())
+    command._check_joints(arm, KnownArm(OPTIONS, joints_file), PlainConsole(file=text, width=120))
+    assert re.search(r"gripper .* -\W", text.getvalue())
+
+
+def test_a_held_joint_is_where_the_models_keyframe_has_it(tmp_path: Path) -> None:
+    """Catches loads and a tip of another pose of the held joint than that of the commands."""
+    model = tmp_path / "arm.xml"
+    spec = mujoco.MjSpec.from_file(ROBOT)
+    spec.add_key(name="home", qpos=[0.0, 0.0, 1.2, 0.0, 0.0, 0.0])
+    spec.compile()
+    model.write_text(spec.to_xml())
+    joints_file = tmp_path / "joints.yaml"
+    joints_file.write_text(f"{JOINTS.read_text()}\nelbow_flex: held\n")
+    options = OPTIONS.replace(robot=str(model), end_effector="tip")
+    known = KnownArm(options, joints_file)
+    pose = np.delete(HOME, 2)
+    torque = known.compensator.torque(pose)
+    np.testing.assert_allclose(known.links.gravity_torque(pose), torque)
+    np.testing.assert_allclose(known.tool.pose(pose)[0], TOOL.pose(np.insert(pose, 2, 1.2))[0])
 
 
 def test_an_arm_that_fell_on_its_stops_passes_its_check() -> None:

@@ -140,6 +140,7 @@ class PositionCompensator:
 
     Attributes:
         joints: Names of the joints, in the order of all arrays.
+        settings: Of each joint by name, as `stiffness` says them.
         constants: What it computes with.
         clipped: Which joints of the last command met a limit, (n,).
         needed: Largest offsets that the weight needs within the joint ranges, (n,) [rad].
@@ -192,6 +193,7 @@ class PositionCompensator:
             named = stiffness if isinstance(stiffness, Mapping) else ()
             joints = commanded_hinges(model, named)
         settings = _read_stiffness(model, stiffness, joints, is_held_left_out=is_free)
+        self.settings = settings
         self.joints = tuple(settings)
         own = list(settings.values())
         lowest, highest = joint_ranges(model, self.joints)
@@ -200,7 +202,7 @@ class PositionCompensator:
         limits = CommandLimits(limit_rad=limit_rad, ramp_s=ramp_s, period_s=period_s)
         self.constants = CompensatorConstants(
             model=model,
-            body=RigidBody(model, self.joints, _held(model, self.joints)),
+            body=RigidBody(model, self.joints, held_positions(model, self.joints)),
             tip=max(int(model.jnt_bodyid[model.joint(name).id]) for name in self.joints),
             compliance=compliance,
             of_command=compliance + 1.0 / gains,
@@ -577,7 +579,7 @@ def _warn(message: str) -> None:
     warnings.warn(message, stacklevel=level)
 
 
-def _held(model: mujoco.MjModel, joints: Sequence[str]) -> dict[int, float]:
+def held_positions(model: mujoco.MjModel, joints: Sequence[str]) -> dict[int, float]:
     """Positions of the joints that are not commanded, by their number [rad], [m]."""
     home = home_of(model)
     others = [j for j in range(model.njnt) if model.joint(j).name not in joints]
