@@ -689,6 +689,25 @@ def emulator() -> RunningEmulator:
     return RunningEmulator(config)
 
 
+@pytest.mark.parametrize("joints", ["rigid", {"stiffness": 300}], ids=["rigid", "diverging"])
+def test_an_emulator_that_ends_by_itself_says_why(joints: Any) -> None:
+    """Catches a traceback of the emulator's process, an exit code of success, and a broken pipe."""
+    config = EmulatorConfig(
+        model_number=777, ids=tuple(range(1, 7)), arm=emulated(joints={"*": joints})
+    )
+    if joints == "rigid":
+        with pytest.raises(ConfigurationError, match="gives no joint its stiffness"):
+            RunningEmulator(config)
+        return
+    with RunningEmulator(config) as running, FeetechBus(running.port) as bus:
+        bus.attach([1])
+        bus.write_torque(1, True)
+        with pytest.raises(ConfigurationError, match="the emulated joints diverge"):
+            running.wait()
+        with pytest.raises(HardwareError, match="ended with exit code 0"):
+            running.state()
+
+
 def two_arms() -> tuple[str, tuple[str, ...]]:
     """Two SO-101 side by side as text, and their twelve joints."""
     spec = mujoco.MjSpec.from_file(ROBOT)

@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from elastic_env.core.errors import ConfigurationError
 from elastic_env.hardware.buses import packets
 from elastic_env.hardware.buses.servo_models import servo_model
 from elastic_env.hardware.clock import Clock
@@ -304,4 +305,7 @@ def _answer(emulator: Emulator, request: dict[str, Any]) -> Any:
 
 
 if __name__ == "__main__":
-    serve(EmulatorConfig.model_validate_json(sys.argv[1]))
+    try:
+        serve(EmulatorConfig.model_validate_json(sys.argv[1]))
+    except ConfigurationError as error:
+        print(json.dumps({"error": str(error)}), flush=True)
