@@ -65,13 +65,6 @@ class Loop:
     def setPacketTimeoutMillis(self, _: float) -> None:  # noqa: N802
         pass
 
-    def setPacketTimeout(self, _: float) -> None:  # noqa: N802
-        pass
-
-    def release(self) -> None:
-        self.is_using = False
-
-    is_using = False
     latency_timer_ms = 1
     latency_timer = "latency_timer"
 

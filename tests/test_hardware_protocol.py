@@ -1,11 +1,15 @@
 """Packets, control tables, late replies: against the maker's examples, the SDK's own functions,
 and random bytes."""
 
+import io
 import itertools
 import math
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
+from dynamixel_sdk import COMM_SUCCESS
 from dynamixel_sdk.protocol2_packet_handler import Protocol2PacketHandler
 from hypothesis import given
 from hypothesis import strategies as st
@@ -21,10 +25,12 @@ from elastic_env.hardware.buses.servo_models import (
     servo_models,
 )
 from elastic_env.hardware.emulator.imu import attitude_packet, checksum
+from elastic_env.hardware.emulator.servos import EmulatedServo
 from elastic_env.hardware.errors import HardwareError
 from elastic_env.hardware.settings import SafetyLimits
 from elastic_env.joint.dynamixel import LOSS_NM, TORQUE_PER_CURRENT
 from elastic_env.joint.small_servos import SMALL_SERVOS
+from tests.lines import Loop
 
 # of the ROBOTIS e-manual, Protocol 2.0: instruction or status, and the bytes on the wire
 EXAMPLES = [
@@ -59,6 +65,44 @@ def test_packets_are_those_of_the_makers_examples(
 def test_checksum_is_the_sdks(data: bytes) -> None:
     """Catches a table of ours that differs from the SDK's in a single entry."""
     assert packets.crc16(data) == Protocol2PacketHandler().updateCRC(0, list(data), len(data))
+
+
+@given(st.binary(max_size=60).filter(lambda data: b"\xff\xff\xfd" not in data))
+def test_packets_are_those_that_the_sdk_sends_and_reads(data: bytes) -> None:
+    """Catches a layout of ours that the maker's own program would not understand; the SDK's
+    stuffing is left out, which is wrong."""
+    sdk = Protocol2PacketHandler()
+    sent = bytearray()
+    line: Any = SimpleNamespace(
+        is_using=False,
+        clearPort=lambda: None,
+        writePort=lambda wire: sent.extend(wire) or len(wire),
+    )
+    length = packets.word(len(data) + 3)
+    sdk.txPacket(line, [0, 0, 0, 0, 7, *length, packets.WRITE, *data, 0, 0])
+    assert bytes(sent) == packets.packet(7, packets.WRITE, data)
+    coming = io.BytesIO(packets.status(7, 0, data))
+    line = SimpleNamespace(readPort=coming.read, isPacketTimeout=lambda: False)
+    received, result = sdk.rxPacket(line, False)
+    assert (result, bytes(received[9:-2])) == (COMM_SUCCESS, data)
+
+
+def test_an_echo_of_the_instruction_is_no_reply() -> None:
+    """Catches an adapter that echoes, whose echoes pass as answers or keep the answers out."""
+
+    class Echo(Loop):
+        def writePort(self, wire: bytes) -> int:  # noqa: N802
+            self._coming += bytes(wire)
+            return super().writePort(wire)
+
+    bus = DynamixelBus("loop")
+    bus.port = Echo([EmulatedServo(1, servo_model(1020), lambda *_: None)])  # type: ignore[assignment]
+    bus.attach([1])
+    bus.write_goal(1, 0.5)
+    states = bus.read_states(0.003)
+    assert states.is_fresh.all()
+    assert [servo.model_number for servo in bus.scan()] == [1020]
+    assert bus.num_retries == 0
 
 
 @given(st.lists(st.sampled_from([0xFF, 0xFD, 0x00, 0x55]), max_size=30).map(bytes))
@@ -171,9 +215,9 @@ def test_a_late_reply_is_never_taken_for_another_requests(lateness: list[float])
 
         requests = 0
 
-        def _transmit(self, servo_id: int, instruction: int, parameters: bytes) -> None:
+        def _transmit(self, servo_id: int, instruction: int, data: bytes) -> None:
             assert (servo_id, instruction) == (packets.BROADCAST, packets.SYNC_READ)
-            start, length = (int.from_bytes(parameters[i : i + 2], "little") for i in (0, 2))
+            start, length = (int.from_bytes(data[i : i + 2], "little") for i in (0, 2))
             reply = bytearray(length)
             at = position.address - start
             reply[at : at + position.size] = position.encode(self.requests)

@@ -258,7 +258,7 @@ def test_a_read_takes_no_more_than_it_asked_for_and_loses_nothing() -> None:
     cleared."""
     master, slave = pty.openpty()
     tty.setraw(slave)
-    port = Port(os.ttyname(slave))
+    port = Port(os.ttyname(slave), 1_000_000)
     port.open()
     try:
         os.write(master, bytes(range(30)))
