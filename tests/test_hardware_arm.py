@@ -6,6 +6,7 @@ import io
 import json
 import os
 import re
+import select
 import signal
 import socket
 import subprocess
@@ -459,7 +460,9 @@ def test_lines_of_a_stream_are_targets_and_bad_ones_change_nothing() -> None:
 
     def send(text: str) -> Array:
         os.write(source, text.encode())
-        target = stream.next(HOME, 0.01)
+        target = None
+        while select.select([end], [], [], 0.0)[0]:
+            target = stream.next(HOME, 0.01)
         assert target is not None
         return target
 
@@ -467,12 +470,44 @@ def test_lines_of_a_stream_are_targets_and_bad_ones_change_nothing() -> None:
     assert send('{"elbow_flex": 0.7}\n{"wrist_fl')[2] == 0.7
     assert send('ex": 0.1}\n')[3] == 0.1
     bad = ["1,2", "nan,0,0,0,0,0", '{"elbow": 1}', "what", '{"elbow_flex": 40}', "\x00"]
-    bad += ['{"elbow_flex": null}', '{"elbow_flex": [1]}', '{"elbow_flex": 1', '{"a":' * 5000]
+    bad += [
+        '{"elbow_flex": true}',
+        '{"elbow_flex": "0.1"}',
+        '{"elbow_flex": null}',
+        '{"elbow_flex": [1]}',
+        '{"elbow_flex": 1',
+        '{"a":' * 5000,
+    ]
     for line in bad:
         assert send(line + "\n")[2] == 0.7
     assert stream.refused == len(bad)
     os.close(source)
     assert stream.next(HOME, 0.01) is None
+    os.close(end)
+
+
+def test_a_fast_sender_does_not_hold_a_cycle() -> None:
+    """Catches an arm whose torque goes off for a cycle that reads for as long as somebody sends,
+    and a line that is cut, of which the rest is another angle."""
+    end, source = os.pipe()
+    stream = Stream(end, ["a"], np.array([-3.0]), np.array([3.0]))
+    lines = 10_000
+    os.write(source, b"-0.5\n" * lines)
+    while stream.number < lines:
+        number = stream.number
+        assert stream.next(np.zeros(1), 0.01) == -0.5
+        assert 0 < stream.number - number < 1000
+    os.write(source, b" " * 60_000)
+    for _ in range(40):
+        stream.next(np.zeros(1), 0.01)
+    os.write(source, b" " * 60_000)
+    for _ in range(40):
+        stream.next(np.zeros(1), 0.01)
+    os.write(source, b"2.5\n")
+    assert stream.next(np.zeros(1), 0.01) == -0.5
+    assert (stream.number, stream.refused) == (lines, 1)
+    assert "at most 100000 characters" in stream.problem
+    os.close(source)
     os.close(end)
 
 
