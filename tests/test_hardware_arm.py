@@ -599,6 +599,17 @@ def test_bad_files_are_told_before_a_port_is_opened(
         options.run(PlainConsole(file=io.StringIO()))
 
 
+def test_a_port_that_is_taken_is_told_before_anything_moves(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Catches an arm that is under torque, and has moved each joint, when nobody can be heard."""
+    monkeypatch.setattr(hardware_compensate, "move_arm", lambda *_: pytest.fail("it has moved"))
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        options = OPTIONS.replace(listen=taken.getsockname()[1])
+        with pytest.raises(OSError, match="in use"):
+            options.run(PlainConsole(file=io.StringIO()))
+
+
 def checked(number: int, **registers: int) -> str:
     """What is printed of servos that are looked at."""
 
@@ -676,6 +687,7 @@ def test_a_log_tells_the_servo_of_a_joint_that_moves_with_others(tmp_path: Path)
     ("changes", "words"),
     [
         ({"targets": None}, "name targets"),
+        ({"targets": Path("x.csv"), "listen": 0}, "name targets"),
         ({"targets": Path("x.csv"), "dry_run": True}, "leave --port out"),
     ],
 )
