@@ -40,6 +40,7 @@ from elastic_env.hardware.emulator.virtual import VirtualBus
 from elastic_env.hardware.errors import FaultError, HardwareError
 from elastic_env.hardware.live import arm as live
 from elastic_env.hardware.live import target_sources as sources
+from elastic_env.hardware.live.consent import require_consent
 from elastic_env.hardware.live.target_sources import Follower, Poses, Socket, Stream, read_targets
 from elastic_env.hardware.safety.supervised_bus import Cycle, SupervisedBus
 from elastic_env.rigid.rigid_body import RigidBody
@@ -710,13 +711,13 @@ def test_an_emulated_arm_needs_all_its_files() -> None:
 
 def test_nobody_at_the_terminal_moves_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches an arm that moves because a script forgot to ask."""
-    monkeypatch.setattr(live.sys, "stdin", SimpleNamespace(isatty=lambda: False))
+    monkeypatch.setattr("sys.stdin", SimpleNamespace(isatty=lambda: False))
     with pytest.raises(HardwareError, match="nobody is at the terminal"):
-        live.require_consent("It will move.", "port")
-    monkeypatch.setattr(live.sys, "stdin", SimpleNamespace(isatty=lambda: True))
+        require_consent("It will move.", "port")
+    monkeypatch.setattr("sys.stdin", SimpleNamespace(isatty=lambda: True))
     monkeypatch.setattr("builtins.input", lambda _: "y")
     with pytest.raises(HardwareError, match="nobody agreed"):
-        live.require_consent("It will move.", "port")
+        require_consent("It will move.", "port")
 
 
 def test_the_live_table_has_a_line_for_each_joint() -> None:

@@ -31,16 +31,8 @@ from elastic_env.hardware.emulator.joints import EmulatedArm
 from elastic_env.hardware.emulator.launch import EmulatorConfig
 from elastic_env.hardware.emulator.virtual import VirtualBus
 from elastic_env.hardware.errors import HardwareError
-from elastic_env.hardware.live.arm import (
-    Arm,
-    ArmState,
-    Compensator,
-    Weighed,
-    answers_yes,
-    require_consent,
-    weigh,
-    wrong_sign,
-)
+from elastic_env.hardware.live.arm import Arm, ArmState, Compensator, Weighed, weigh, wrong_sign
+from elastic_env.hardware.live.consent import answers_yes, require_consent
 from elastic_env.hardware.live.target_sources import Poses, Socket, Stream, Targets
 from elastic_env.hardware.safety import realtime
 from elastic_env.hardware.safety.checks import check_bus
