@@ -23,6 +23,7 @@ from elastic_env.hardware.buses.servo_models import (
     NUM_BLOCKS,
     servo_model,
     servo_models,
+    torque_of_current,
 )
 from elastic_env.hardware.emulator.imu import attitude_packet, checksum
 from elastic_env.hardware.emulator.servos import EmulatedServo
@@ -265,14 +266,16 @@ def test_torque_line_runs_both_ways(number: int) -> None:
     """Catches a sign or an offset that emulator and driver would not share."""
     model = servo_model(number)
     for torque in (-52.5, -1.0, 0.5, 34.6):
-        assert model.torque(model.current(torque)) == pytest.approx(torque)
+        current = np.array(model.current(torque))
+        found = torque_of_current(current, model.torque_per_ampere, model.loss)
+        assert found == pytest.approx(torque)
 
 
 def test_the_torque_line_of_the_table_is_that_of_the_joint() -> None:
     """Catches a figure that is changed in one of two places."""
     model = servo_model(54024)
     assert (model.torque_per_ampere, model.loss) == (TORQUE_PER_CURRENT, LOSS_NM)
-    assert model.torque(0.3) == 0.0
+    assert torque_of_current(np.array(0.3), model.torque_per_ampere, model.loss) == 0.0
     assert model.largest_torque == LARGEST_TORQUE_NM
     for name in ("STS3215", "STS3250"):
         (small,) = (one for one in servo_models().values() if one.name == name)

@@ -483,7 +483,7 @@ def test_two_buses_are_read_side_by_side(emulator: RunningEmulator) -> None:
 
 def test_wrong_model_number_is_refused_before_anything_is_written() -> None:
     """Catches registers of one model written to another."""
-    with RunningEmulator(EmulatorConfig(claimed_model_number=1021)) as strange:
+    with RunningEmulator(EmulatorConfig(registers={"model_number": 1021})) as strange:
         with (
             DynamixelBus(strange.port) as bus,
             pytest.raises(HardwareError, match="no control table for model number 1021"),

@@ -100,8 +100,6 @@ class EmulatorConfig(Model):
 
     model_number: int = 54024
     """Type of the servos."""
-    claimed_model_number: int | None = None
-    """Model number that they report, if it is to be a wrong one."""
     ids: tuple[int, ...] = (1,)
     """Their ids."""
     registers: dict[str, int] = {}

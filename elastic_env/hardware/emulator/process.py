@@ -120,13 +120,12 @@ class Emulator:
             self._joints = Joints(config.testbed, len(config.ids), now)
         else:
             self._joints = ArmJoints(config.arm, now)
-        claimed = config.claimed_model_number
         self._servos: list[EmulatedServo] = []
         for index, servo_id in enumerate(config.ids):
             motion = partial(self._joints.motion, index)
             note = partial(self._note, index)
-            shared = (note, claimed, motion, config.registers)
-            self._servos.append(EmulatedServo(servo_id, model, *shared))
+            servo = EmulatedServo(servo_id, model, note, motion, config.registers)
+            self._servos.append(servo)
         self._bus = EmulatedBus(self._servos)
         self._imu = EmulatedImu(config, now)
         self._parser = self._bus.wire.parser()
