@@ -47,7 +47,7 @@ from elastic_env.rigid.rigid_body import RigidBody
 from elastic_env.rigid.tree.end_effector import EndEffector
 from tests.busy import once_more
 from tests.hardware_trials.trials import compare_replies
-from tests.lines import VirtualArm, looped
+from tests.lines import looped
 from tests.test_hardware_arm_servos import servos
 from tests.test_hardware_faults import SERVO, Case, named
 from train.commands import hardware_arm as command
@@ -103,6 +103,17 @@ def emulated(**changes: Any) -> EmulatedArm:
     return EmulatedArm(**values | changes)
 
 
+def virtual_arm(arm: EmulatedArm) -> VirtualBus:
+    return VirtualBus(EmulatorConfig(model_number=777, ids=tuple(range(1, 7)), arm=arm))
+
+
+def goals_of(virtual: VirtualBus, joint: int) -> Array:
+    """Goals that a servo has heard [rad]."""
+    events = virtual.emulator.events
+    counts = [v for _, i, name, v in events if (i, name) == (joint + 1, "goal_position")]
+    return np.array([servo_model(777).angle(count) for count in counts])
+
+
 def begun(virtual: live.ArmBus, commands: Any, settings: ArmSettings = SETTINGS) -> live.Arm:
     placed = settings.servos(NAMES)
     ranges = placed.servo_ranges(LOWEST, HIGHEST, settings.limits)
@@ -112,14 +123,14 @@ def begun(virtual: live.ArmBus, commands: Any, settings: ArmSettings = SETTINGS)
 
 
 def rests(
-    arm: live.Arm, virtual: VirtualArm, poses: Array, hold_s: float = 0.5, apart: float = 0.15
+    arm: live.Arm, virtual: VirtualBus, poses: Array, hold_s: float = 0.5, apart: float = 0.15
 ) -> Array:
     """Link angles at poses that are approached from both sides, (poses, 2, n) [rad]."""
     visits = [way for pose in poses for side in (-apart, apart) for way in (pose + side, pose)]
     targets = Poses(np.array(visits), hold_s)
     last: dict[int, Array] = {}
     for _ in arm.play(targets):
-        last[targets.number] = virtual.joints.q.copy()
+        last[targets.number] = virtual.links
     return np.array([last[i] for i in range(1, len(visits), 2)]).reshape(len(poses), 2, -1)
 
 
@@ -159,7 +170,7 @@ def test_compensation_places_the_tip_from_both_sides(tmp_path: Path) -> None:
         ("exact", compensator()),
         ("misjudged", compensator(file=misjudged(tmp_path))),
     ):
-        virtual = VirtualArm(emulated())
+        virtual = virtual_arm(emulated())
         arm = begun(virtual, commands)
         found[name] = placed(rests(arm, virtual, poses), poses)
     assert found["plain"][0] > 0.015
@@ -174,9 +185,9 @@ def test_compensation_places_the_tip_from_both_sides(tmp_path: Path) -> None:
 def test_thirty_poses_from_both_sides() -> None:
     """Catches a gain that three poses show by chance: the check of docs/hardware.md."""
     poses = drawn(30)
-    virtual = VirtualArm(emulated())
+    virtual = virtual_arm(emulated())
     plain = placed(rests(begun(virtual, Plain()), virtual, poses, 1.0), poses)
-    virtual = VirtualArm(emulated())
+    virtual = virtual_arm(emulated())
     best = placed(rests(begun(virtual, compensator()), virtual, poses, 1.0), poses)
     print(f"tip {1e3 * plain[0]:.1f} to {1e3 * best[0]:.2f} mm", end=", ")
     print(f"spread {1e3 * plain[1]:.1f} to {1e3 * best[1]:.2f} mm")
@@ -187,15 +198,15 @@ def test_thirty_poses_from_both_sides() -> None:
 def test_an_uncompensated_arm_reaches_a_part_of_a_small_lift() -> None:
     """Catches an emulated arm that is better than those that users complain of: P gain 16 and the
     gear's friction take some 40 % of a small command against the weight."""
-    virtual = VirtualArm(emulated())
+    virtual = virtual_arm(emulated())
     arm = begun(virtual, Plain())
-    virtual.advance(1.0)
-    before = virtual.joints.q.copy()
+    virtual.sleep(1.0)
+    before = virtual.links
     lifted = HOME.copy()
     lifted[1] -= 0.1
     for _ in arm.play(Poses(lifted[None], 1.0)):
         pass
-    share = (virtual.joints.q - before)[1] / -0.1
+    share = (virtual.links - before)[1] / -0.1
     assert 0.4 < share < 0.8
 
 
@@ -203,7 +214,7 @@ def test_directions_and_zeros_of_the_mounting_are_those_of_the_arm() -> None:
     """Catches a sign that is used on the way out but not on the way in."""
     direction = (1, -1, 1, -1, -1, 1)
     zero = (0.3, -0.2, 0.4, 0.1, -0.5, 0.2)
-    virtual = VirtualArm(emulated(direction=direction, zero_rad=zero))
+    virtual = virtual_arm(emulated(direction=direction, zero_rad=zero))
     own = zip(NAMES, direction, zero, strict=True)
     joints = {
         name: {"id": i, "direction": sign, "zero_rad": at}
@@ -223,7 +234,7 @@ def test_a_turned_joint_is_found_by_its_load() -> None:
     turned = NAMES.index("elbow_flex")
     direction = [1] * 6
     direction[turned] = -1
-    virtual = VirtualArm(emulated(direction=tuple(direction)))
+    virtual = virtual_arm(emulated(direction=tuple(direction)))
     arm = begun(virtual, compensator())
     weighed = [live.weigh(arm, joint, 0.08) for joint in range(6)]
     known = KnownArm(OPTIONS, JOINTS)
@@ -231,7 +242,7 @@ def test_a_turned_joint_is_found_by_its_load() -> None:
         command.require_signs(
             arm.servos, weighed, known.links.gravity_torque, known.compensator.settings
         )
-    right = VirtualArm(emulated())
+    right = virtual_arm(emulated())
     arm = begun(right, compensator())
     weighed = [live.weigh(arm, joint, 0.08) for joint in range(6)]
     command.require_signs(
@@ -276,7 +287,7 @@ def test_a_wrong_zero_shows_in_the_loads(own: str, tmp_path: Path) -> None:
     joints_file.write_text("'*':\n" + textwrap.indent(own, "  ") if own else JOINTS.read_text())
     for zero in (0.0, 1.4):
         zeros = (0.0, zero, 0.0, 0.0, 0.0, 0.0)
-        virtual = VirtualArm(emulated(zero_rad=zeros))
+        virtual = virtual_arm(emulated(zero_rad=zeros))
         joints = dict(SETTINGS.joints)
         known = KnownArm(OPTIONS, joints_file)
         arm = begun(virtual, compensator(), SETTINGS.replace(joints=joints))
@@ -294,7 +305,7 @@ def test_a_joint_that_the_file_leaves_out_is_checked_as_a_rigid_one(tmp_path: Pa
     joints_file = tmp_path / "joints.yaml"
     joints_file.write_text(JOINTS.read_text().replace('"*"', '"[!g]*"'))
     text = io.StringIO()
-    arm = begun(VirtualArm(emulated()), compensator())
+    arm = begun(virtual_arm(emulated()), compensator())
     command._check_joints(arm, KnownArm(OPTIONS, joints_file), PlainConsole(file=text, width=120))
     assert re.search(r"gripper .* -\W", text.getvalue())
 
@@ -319,8 +330,7 @@ def test_a_held_joint_is_where_the_models_keyframe_has_it(tmp_path: Path) -> Non
 def test_an_arm_that_fell_on_its_stops_passes_its_check() -> None:
     """Catches a second command that refuses an arm which lies where the first one let it down: its
     shoulder rests on a stop, beyond its range."""
-    config = EmulatorConfig(model_number=777, ids=tuple(range(1, 7)), arm=emulated(home={}))
-    bus = VirtualBus(config)
+    bus = virtual_arm(emulated(home={}))
     begun(bus, Plain()).close()
     bus.sleep(3.0)
     assert bus.links[1] > HIGHEST[1]
@@ -339,50 +349,50 @@ def test_a_move_away_from_a_stop_is_told_with_its_direction() -> None:
     """Catches a joint that is moved into its stop, or is said to go the other way."""
     home = HOME.copy()
     home[3] = HIGHEST[3] - 0.05
-    virtual = VirtualArm(emulated(home=dict(zip(NAMES, home.tolist(), strict=True))))
+    virtual = virtual_arm(emulated(home=dict(zip(NAMES, home.tolist(), strict=True))))
     arm = begun(virtual, compensator())
     assert arm.way_off_stops(2, 0.08) == 0.0
     assert arm.way_off_stops(3, 0.08) == pytest.approx(-0.11, abs=1e-3)
     weighed = live.weigh(arm, 3, 0.08)
     assert weighed.first == pytest.approx(-0.19, abs=1e-3)
     assert 0.5 < weighed.moved < 1.1
-    assert np.array(virtual.goals)[:, 3].max() <= HIGHEST[3] - 0.05 + 1e-3
-    virtual.bus.write_register(4, "torque_limit", 5)
+    assert goals_of(virtual, 3).max() <= HIGHEST[3] - 0.05 + 1e-3
+    virtual.driver.write_register(4, "torque_limit", 5)
     with pytest.raises(HardwareError, match=r"about \+1.5 rad.*at \+1.60. rad, near an end of its"):
         live.weigh(arm, 3, 0.08)
 
 
 def test_a_blocked_joint_is_named() -> None:
     """Catches a check that passes where nothing moves."""
-    virtual = VirtualArm(emulated())
+    virtual = virtual_arm(emulated())
     arm = begun(virtual, compensator())
     joint = NAMES.index("wrist_flex")
-    virtual.bus.write_register(4, "torque_limit", 20)
+    virtual.driver.write_register(4, "torque_limit", 20)
     with pytest.raises(HardwareError, match=r"'wrist_flex' follows .* % of a move by ±0.08 rad"):
         live.weigh(arm, joint, 0.08)
 
 
 def test_a_fault_names_servo_and_joint() -> None:
     """Catches a number where the user knows a name."""
-    virtual = VirtualArm(emulated())
+    virtual = virtual_arm(emulated())
     arm = begun(virtual, compensator())
     arm.cycle(HOME)
-    virtual.servos[2].heat(True)
-    virtual._guard._hottest = np.full(6, 70.0)  # type: ignore[union-attr]
+    virtual.emulator._servos[2].heat(True)
+    virtual._supervisor._guard._hottest = np.full(6, 70.0)  # type: ignore[union-attr]
     with pytest.raises(FaultError, match=r"too hot.*\(servo 3 is elbow_flex\)"):
         list(arm.play(Poses(drawn(1), 1.0)))
 
 
 def test_goals_stay_within_the_ranges_of_each_joint() -> None:
     """Catches one range for all servos, and a target beyond it that reaches the wire."""
-    virtual = VirtualArm(emulated())
+    virtual = virtual_arm(emulated())
     narrow = SETTINGS.replace(limits=ARM_LIMITS.replace(highest_rad=0.6))
     arm = begun(virtual, Plain(), narrow)
+    goals = []
     for _ in range(400):
         arm.follower.step(np.full(6, 1.0), 0.01)
-        arm.cycle(np.full(6, 1.0))
-    goals = np.array(virtual.goals)
-    assert goals.max(axis=0) == pytest.approx(0.6)
+        goals.append(arm.cycle(np.full(6, 1.0)).command)
+    assert np.array(goals).max(axis=0) == pytest.approx(0.6)
     assert arm.counts.limited > 0
     with pytest.raises(ConfigurationError, match="'gripper' has no range"):
         SETTINGS.servos(NAMES).servo_ranges(LOWEST, HIGHEST, ARM_LIMITS.replace(highest_rad=-0.2))
@@ -662,7 +672,7 @@ def test_the_log_is_one_that_identify_reads(tmp_path: Path) -> None:
 
 def logged(folder: Path, commands: Any, poses: Array) -> tuple[list[live.ArmState], list[Path]]:
     """What an arm does at poses, and the logs of its servos."""
-    arm = begun(VirtualArm(emulated()), commands)
+    arm = begun(virtual_arm(emulated()), commands)
     states = list(arm.play(Poses(poses, 0.5)))
     path = folder / "log.csv"
     with path.open("w") as file:
@@ -722,7 +732,7 @@ def test_nobody_at_the_terminal_moves_nothing(monkeypatch: pytest.MonkeyPatch) -
 
 def test_the_live_table_has_a_line_for_each_joint() -> None:
     """Catches a column that is of another joint."""
-    virtual = VirtualArm(emulated())
+    virtual = virtual_arm(emulated())
     arm = begun(virtual, compensator())
     state = arm.cycle(HOME)
     text = command.live_table(state, NAMES, arm, Poses(HOME[None], 1.0))
@@ -1035,7 +1045,7 @@ def test_a_patient_command_bears_twice_as_many_missing_replies(tmp_path: Path) -
     said = []
     for patient in (False, True):
         known = KnownArm(OPTIONS.replace(mounting=mounting, patient=patient), JOINTS)
-        bus = VirtualBus(EmulatorConfig(model_number=777, ids=tuple(range(1, 7)), arm=emulated()))
+        bus = virtual_arm(emulated())
         arm = begun(bus, Plain(), known.settings)
         assert known.settings.limits.slew_rad_s == 1.5
         arm.cycle(HOME)
@@ -1094,7 +1104,7 @@ def test_a_virtual_bus_may_keep_the_pace_of_somebody_who_sends_targets() -> None
 def test_an_arm_runs_at_both_ends_of_its_range_of_rates(rate_hz: float) -> None:
     """Catches a period of 20 ms that is taken for a longer wait than the 20 ms that are allowed, by
     the last bit of a clock."""
-    bus = VirtualBus(EmulatorConfig(model_number=777, ids=tuple(range(1, 7)), arm=emulated()))
+    bus = virtual_arm(emulated())
     arm = begun(bus, Plain(), SETTINGS.replace(rate_hz=rate_hz))
     play(arm, Poses(drawn(5), 1.0), 300)
     assert arm.counts.cycles == 300
