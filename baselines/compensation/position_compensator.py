@@ -219,7 +219,10 @@ class PositionCompensator:
         )
         self._said: set[str] = set()
         self.reset()
-        self.needed = self.constants.of_command * self._most_passed(self._heaviest())
+        heaviest = self._heaviest()
+        if self.constants.friction is not None:
+            heaviest = self.constants.friction.most_passed(heaviest)
+        self.needed = self.constants.of_command * heaviest
         if (self.needed > limits.limit_rad).any():
             self._warn_of_offset(self.needed, "at some pose within the joint ranges")
 
@@ -420,12 +423,6 @@ class PositionCompensator:
             torque + self.constants.viscous * rate, rate, self._rubbed
         )
 
-    def _most_passed(self, torque: Array) -> Array:
-        """Largest torque that is passed to links under loads of either sign, (n,) [N·m]."""
-        if self.constants.friction is None:
-            return torque
-        return self.constants.friction.most_passed(torque)
-
     def _passed_at_rest(self, q: Array) -> Array:
         """Torque that is passed to links at rest, (..., n) [rad] to (..., n) [N·m]."""
         torque = self.constants.body.gravity_torque(q)
@@ -539,7 +536,10 @@ class PositionCompensator:
     def _checked(self, name: str, given: Any, unit: str) -> Array:
         """An argument of a public method, as (n,)."""
         n = len(self.joints)
-        values = _array(given)
+        try:
+            values = np.asarray(given, dtype=np.float64)
+        except (TypeError, ValueError):
+            values = np.empty(0)
         if values.shape != (n,):
             is_array = isinstance(given, np.ndarray)
             size = f", an array of shape {values.shape}" if is_array else ""
@@ -779,11 +779,3 @@ def _by_joint(name: str, given: Any, joints: Sequence[str]) -> Mapping[str, Any]
 
 def _joint_names(model: mujoco.MjModel) -> list[str]:
     return [name for j in range(model.njnt) if (name := model.joint(j).name)]
-
-
-def _array(given: Any) -> Array:
-    """The argument as an array; empty where it is none of numbers."""
-    try:
-        return np.asarray(given, dtype=np.float64)
-    except (TypeError, ValueError):
-        return np.empty(0)

@@ -43,7 +43,6 @@ from elastic_env.joint.model_file import compiled_model
 from elastic_env.joint.small_servos import SMALL_SERVOS
 from elastic_env.rigid.tree.end_effector import EndEffector, outermost_body
 from elastic_env.robots.robot.joints import STIFF_OVER_SERVO
-from elastic_env.world.robot_model import joint_ranges
 from train.runs.console import can_redraw, make_table, print_files
 from train.runs.folders import run_folder
 
@@ -152,7 +151,8 @@ class KnownArm:
                 " stiffness and position_gain in N·m/rad"
             )
         self.servos = self.settings.servos(self.joints)
-        self.lowest, self.highest = joint_ranges(self.model, self.joints)
+        self.lowest = self.compensator.constants.lowest
+        self.highest = self.compensator.constants.highest
         self.ranges = self.servos.servo_ranges(self.lowest, self.highest, self.settings.limits)
         self.links = self.compensator.constants.body
         tool = options.end_effector or outermost_body(self.model)

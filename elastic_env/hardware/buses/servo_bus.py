@@ -485,11 +485,6 @@ class BusGroup:
         """Bus and id of each servo."""
         return [(bus, servo_id) for bus in self.buses for servo_id in bus.ids]
 
-    @property
-    def names(self) -> list[str]:
-        """The servos' names in messages."""
-        return [servo_name(bus, servo_id) for bus, servo_id in self.servos]
-
     def write_goals(self, angles: Array) -> None:
         """Command all servos, (n,) [rad]."""
         ends = np.cumsum([len(bus.ids) for bus in self.buses])[:-1]

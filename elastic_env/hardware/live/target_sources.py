@@ -75,7 +75,7 @@ class Poses(Targets):
 
     @override
     def next(self, desired: Array, period_s: float) -> Array | None:
-        if self.is_reached(desired):
+        if _is_reached(desired, self.poses[self.number]):
             self._held_s += period_s
         if self._held_s > self._hold_s:
             self._held_s = 0.0
@@ -83,10 +83,6 @@ class Poses(Targets):
         if self.number >= len(self.poses):
             return None
         return self.poses[self.number]
-
-    def is_reached(self, desired: Array) -> bool:
-        """True if the desired angles are those of the pose."""
-        return bool(np.abs(desired - self.poses[self.number]).max() < _REACHED_RAD)
 
 
 class Trajectory(Targets):
@@ -104,10 +100,15 @@ class Trajectory(Targets):
     @override
     def next(self, desired: Array, period_s: float) -> Array | None:
         if not self._has_begun:
-            self._has_begun = bool(np.abs(desired - self._q[0]).max() < _REACHED_RAD)
+            self._has_begun = _is_reached(desired, self._q[0])
             return self._q[0]
         self.number += 1
         return self._q[self.number] if self.number < len(self._q) else None
+
+
+def _is_reached(desired: Array, pose: Array) -> bool:
+    """True if the desired angles are those of a pose."""
+    return bool(np.abs(desired - pose).max() < _REACHED_RAD)
 
 
 class Stream(Targets):
