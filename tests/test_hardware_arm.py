@@ -766,13 +766,42 @@ def test_an_emulator_that_ends_by_itself_says_why(joints: Any) -> None:
             running.state()
 
 
-def two_arms() -> tuple[str, tuple[str, ...]]:
-    """Two SO-101 side by side as text, and their twelve joints."""
+TWELVE = tuple(range(1, 13))
+TWELVE_NAMES = (*NAMES, *(f"other_{name}" for name in NAMES))
+PATIENCE = 10
+RELEASE_S = 0.3
+RATE_HZ = 50.0
+
+
+def two_arms() -> EmulatorConfig:
+    """Two SO-101 side by side, on one bus of twelve servos."""
     spec = mujoco.MjSpec.from_file(ROBOT)
     other = mujoco.MjSpec.from_file(ROBOT)
     spec.attach(other, prefix="other_", frame=spec.worldbody.add_frame(pos=[0.0, 0.5, 0.0]))
     spec.compile()
-    return spec.to_xml(), (*NAMES, *(f"other_{name}" for name in NAMES))
+    home = dict(zip(TWELVE_NAMES, [*HOME, *HOME], strict=True))
+    zeros = {"direction": (1,) * 12, "zero_rad": (0.0,) * 12}
+    twins = emulated(model=spec.to_xml(), order=TWELVE_NAMES, home=home, **zeros)
+    return EmulatorConfig(model_number=777, ids=TWELVE, arm=twins)
+
+
+def begun_twins(bus: live.ArmBus) -> live.Arm:
+    """Both arms under torque, as one."""
+    limits = ARM_LIMITS.replace(patience_cycles=PATIENCE, release_s=RELEASE_S)
+    joints = {name: ServoPlace(id=i) for i, name in zip(TWELVE, TWELVE_NAMES, strict=True)}
+    settings = ArmSettings(port="virtual", joints=joints, limits=limits, rate_hz=RATE_HZ)
+    servo_map = settings.servos(TWELVE_NAMES)
+    ranges = servo_map.servo_ranges(np.tile(LOWEST, 2), np.tile(HIGHEST, 2), limits)
+    arm = live.Arm(bus, settings, servo_map, Plain(), ranges)
+    arm.begin()
+    return arm
+
+
+def require_goals_within(arm: live.Arm, events: Any) -> None:
+    """Check all goals that servos have heard."""
+    goals = [(i - 1, v) for _, i, name, v in events if name == "goal_position"]
+    counts = 2048 + arm._ranges * 4096 / (2.0 * np.pi)
+    assert all(counts[i, 0] - 1 <= value <= counts[i, 1] + 1 for i, value in goals)
 
 
 @pytest.mark.slow
@@ -834,23 +863,10 @@ def test_an_arm_sinks_when_its_program_ends(how: signal.Signals) -> None:
 def test_no_fault_of_an_arms_bus_is_silent(fault: dict[str, Any], words: str) -> None:
     """Catches an arm that goes on with a servo that is hot, gone, or answers for another: twelve
     servos on one bus, in motion."""
-    model, names = two_arms()
-    home = dict(zip(names, [*HOME, *HOME], strict=True))
-    zeros = {"direction": (1,) * 12, "zero_rad": (0.0,) * 12}
-    twins = emulated(model=model, order=names, home=home, **zeros)
-    ids = tuple(range(1, 13))
-    config = EmulatorConfig(model_number=777, ids=ids, arm=twins)
-    lowest, highest = np.tile(LOWEST, 2), np.tile(HIGHEST, 2)
-    with RunningEmulator(config) as running:
-        limits = ARM_LIMITS.replace(patience_cycles=10, release_s=0.3)
-        joints = {name: ServoPlace(id=i) for i, name in enumerate(names, 1)}
-        settings = ArmSettings(port=running.port, joints=joints, limits=limits, rate_hz=50.0)
-        placed_at = settings.servos(names)
-        ranges = placed_at.servo_ranges(lowest, highest, limits)
-        bus = SupervisedBus({running.port: placed_at.ids}, protocol="feetech")
+    with RunningEmulator(two_arms()) as running:
+        bus = SupervisedBus({running.port: TWELVE}, protocol="feetech")
         with contextlib.suppress(HardwareError), bus:
-            arm = live.Arm(bus, settings, placed_at, Plain(), ranges)
-            arm.begin()
+            arm = begun_twins(bus)
             targets = Poses(np.tile(drawn(5), 2), 1.0)
             for number, _ in zip(range(50), arm.play(targets), strict=False):
                 assert number < 50
@@ -858,12 +874,10 @@ def test_no_fault_of_an_arms_bus_is_silent(fault: dict[str, Any], words: str) ->
             with pytest.raises(HardwareError, match=words):
                 list(arm.play(targets))
             running.faults(**Faults(**{"unplugged": "unplugged" in fault}).model_dump())
-        counts = 2048 + ranges * 4096 / (2.0 * np.pi)
         events = running.events()
-        goals = [(i - 1, v) for _, i, name, v in events if name == "goal_position"]
-        assert all(counts[i, 0] - 1 <= value <= counts[i, 1] + 1 for i, value in goals)
+        require_goals_within(arm, events)
         if "unplugged" not in fault:
-            assert {i for _, i, *change in events if change == ["torque_enable", 0]} == set(ids)
+            assert {i for _, i, *change in events if change == ["torque_enable", 0]} == set(TWELVE)
             assert not any(running.state()["torque_on"])
 
 
@@ -871,8 +885,6 @@ LATER = Case({"late": 0.01, "late_s": 0.03}, goes_on="they come in the midst of 
 ON_ARM = [*SERVO, LATER]
 DELAYS = ("latency_s", "late_s")
 """An arm waits for 6 ms: what is below that is not missed."""
-PATIENCE = 10
-RELEASE_S = 0.3
 TO_FIND = {"hot": TEMPERATURE_CYCLES, "overload": 1, "unplugged": 1}
 """Cycles in which a fault is found, where missing replies do not tell it."""
 
@@ -897,19 +909,8 @@ def test_every_fault_of_twelve_servos_ends_or_holds_the_motion(
     """Catches an arm that goes on with a servo that is hot, gone, or answers for another, an old
     reply that is taken for a new one, a goal beyond a range, and torque that falls too late: all
     kinds of fault, in motion, driver and supervisor in virtual time."""
-    model, names = two_arms()
-    home = dict(zip(names, [*HOME, *HOME], strict=True))
-    zeros = {"direction": (1,) * 12, "zero_rad": (0.0,) * 12}
-    twins = emulated(model=model, order=names, home=home, **zeros)
-    ids = tuple(range(1, 13))
-    bus = WatchedBus(EmulatorConfig(model_number=777, ids=ids, arm=twins))
-    limits = ARM_LIMITS.replace(patience_cycles=PATIENCE, release_s=RELEASE_S)
-    joints = {name: ServoPlace(id=i) for i, name in enumerate(names, 1)}
-    settings = ArmSettings(port="virtual", joints=joints, limits=limits, rate_hz=50.0)
-    servo_map = settings.servos(names)
-    ranges = servo_map.servo_ranges(np.tile(LOWEST, 2), np.tile(HIGHEST, 2), limits)
-    arm = live.Arm(bus, settings, servo_map, Plain(), ranges)  # type: ignore[arg-type]
-    arm.begin()
+    bus = WatchedBus(two_arms())
+    arm = begun_twins(bus)
     targets = Poses(np.tile(drawn(5), 2), 1.0)
     play(arm, targets, 20)
     began_s = bus.now_s
@@ -927,10 +928,8 @@ def test_every_fault_of_twelve_servos_ends_or_holds_the_motion(
             play(arm, targets, 200)
         said = str(caught.value)
     events = bus.emulator.events
-    goals = [(i - 1, v) for _, i, name, v in events if name == "goal_position"]
-    counts = 2048 + ranges * 4096 / (2.0 * np.pi)
-    assert all(counts[i, 0] - 1 <= value <= counts[i, 1] + 1 for i, value in goals)
-    taken, wrong = compare_replies(events, bus.seen, ids, servo_model(777))
+    require_goals_within(arm, events)
+    taken, wrong = compare_replies(events, bus.seen, TWELVE, servo_model(777))
     assert taken["accepted"] > 200
     assert not wrong
     cannot_be_told = {"unheard", "unplugged"} & case.faults.keys()
@@ -941,8 +940,8 @@ def test_every_fault_of_twelve_servos_ends_or_holds_the_motion(
         assert case.goes_on or re.search("Switch their power off|not confirmed by servo", said)
     else:
         found = TO_FIND.get(next(iter(case.faults)), PATIENCE)
-        assert off.keys() == set(ids)
-        assert max(off.values()) < began_s + (found + 1) / settings.rate_hz + RELEASE_S + 0.03
+        assert off.keys() == set(TWELVE)
+        assert max(off.values()) < began_s + (found + 1) / RATE_HZ + RELEASE_S + 0.03
         assert bus.emulator.state["torque_on"] == [False] * 12
     if "unplugged" not in case.faults:
         bus.emulator.set_faults(Faults().model_dump())

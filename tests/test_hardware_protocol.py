@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from elastic_env.core.errors import ConfigurationError
-from elastic_env.hardware.buses import packets
+from elastic_env.hardware.buses import feetech_packets, packets
 from elastic_env.hardware.buses.dynamixel_bus import DynamixelBus
 from elastic_env.hardware.buses.servo_bus import Status
 from elastic_env.hardware.buses.servo_models import (
@@ -49,14 +49,31 @@ EXAMPLES = [
     ((1, 0x08, b""), "FF FF FD 00 01 03 00 08 2F 4E"),
 ]
 
+# FT-SCS protocol manual (Feetech), likewise
+FEETECH_EXAMPLES = [
+    ((1, packets.PING, b""), "FF FF 01 02 01 FB"),
+    ((1, packets.READ, bytes([0x38, 2])), "FF FF 01 04 02 38 02 BE"),
+    ((1, 0, bytes([0x18, 5])), "FF FF 01 04 00 18 05 DD"),
+    (
+        (1, packets.WRITE, bytes([0x2A, 0, 8, 0, 0, 0xE8, 3])),
+        "FF FF 01 09 03 2A 00 08 00 00 E8 03 D5",
+    ),
+]
 
-@pytest.mark.parametrize(("content", "wire"), EXAMPLES)
+
+@pytest.mark.parametrize(
+    ("protocol", "content", "wire"),
+    [
+        *((packets, *example) for example in EXAMPLES),
+        *((feetech_packets, *example) for example in FEETECH_EXAMPLES),
+    ],
+)
 def test_packets_are_those_of_the_makers_examples(
-    content: tuple[int, int, bytes], wire: str
+    protocol: Any, content: tuple[int, int, bytes], wire: str
 ) -> None:
     """Catches a wrong checksum, byte order or length in what both our ends would agree on."""
-    assert packets.packet(*content) == bytes.fromhex(wire)
-    found = packets.Parser().parse(bytes.fromhex(wire))
+    assert protocol.packet(*content) == bytes.fromhex(wire)
+    found = protocol.Parser().parse(bytes.fromhex(wire))
     assert [(p.servo_id, p.instruction, p.parameters, p.is_intact) for p in found] == [
         (*content, True)
     ]

@@ -35,7 +35,7 @@ from elastic_env.hardware.safety.realtime import (
 from elastic_env.hardware.safety.supervised_bus import SupervisedBus
 from elastic_env.hardware.settings import PATIENT_LIMITS, SafetyLimits
 from elastic_env.robots.testbed.config import TestbedConfig
-from tests.emulators import wait_until_rest
+from tests.emulators import wait_until_free, wait_until_rest
 from tests.hardware_trials.wave import PERIOD_S, goal
 
 _USB_LATENCY = Faults(latency_s=1e-3)
@@ -494,16 +494,7 @@ def _end_once(
     finally:
         program.kill()
         program.communicate()
-        _wait_until_free(emulator.port)
-
-
-def _wait_until_free(port: str) -> None:
-    """Wait until the supervisor of a program that has ended has given the port back."""
-    deadline = time.monotonic() + 5.0
-    while time.monotonic() < deadline:
-        with contextlib.suppress(PortError), DynamixelBus(port):
-            return
-        time.sleep(0.005)
+        wait_until_free(emulator.port)
 
 
 def unplugged(share: float) -> Trial:
