@@ -785,16 +785,14 @@ def two_arms() -> EmulatorConfig:
     return EmulatorConfig(model_number=777, ids=TWELVE, arm=twins)
 
 
-def begun_twins(bus: live.ArmBus) -> live.Arm:
-    """Both arms under torque, as one."""
+def twin_arm(bus: live.ArmBus) -> live.Arm:
+    """Both arms as one."""
     limits = ARM_LIMITS.replace(patience_cycles=PATIENCE, release_s=RELEASE_S)
     joints = {name: ServoPlace(id=i) for i, name in zip(TWELVE, TWELVE_NAMES, strict=True)}
     settings = ArmSettings(port="virtual", joints=joints, limits=limits, rate_hz=RATE_HZ)
     servo_map = settings.servos(TWELVE_NAMES)
     ranges = servo_map.servo_ranges(np.tile(LOWEST, 2), np.tile(HIGHEST, 2), limits)
-    arm = live.Arm(bus, settings, servo_map, Plain(), ranges)
-    arm.begin()
-    return arm
+    return live.Arm(bus, settings, servo_map, Plain(), ranges)
 
 
 def require_goals_within(arm: live.Arm, events: Any) -> None:
@@ -865,8 +863,9 @@ def test_no_fault_of_an_arms_bus_is_silent(fault: dict[str, Any], words: str) ->
     servos on one bus, in motion."""
     with RunningEmulator(two_arms()) as running:
         bus = SupervisedBus({running.port: TWELVE}, protocol="feetech")
+        arm = twin_arm(bus)
         with contextlib.suppress(HardwareError), bus:
-            arm = begun_twins(bus)
+            arm.begin()
             targets = Poses(np.tile(drawn(5), 2), 1.0)
             for number, _ in zip(range(50), arm.play(targets), strict=False):
                 assert number < 50
@@ -910,7 +909,8 @@ def test_every_fault_of_twelve_servos_ends_or_holds_the_motion(
     reply that is taken for a new one, a goal beyond a range, and torque that falls too late: all
     kinds of fault, in motion, driver and supervisor in virtual time."""
     bus = WatchedBus(two_arms())
-    arm = begun_twins(bus)
+    arm = twin_arm(bus)
+    arm.begin()
     targets = Poses(np.tile(drawn(5), 2), 1.0)
     play(arm, targets, 20)
     began_s = bus.now_s
