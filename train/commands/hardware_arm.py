@@ -227,9 +227,9 @@ def move_arm(
     options = known.options
     recorded = options.model_dump(mode="json", exclude={"output"})
     with contextlib.ExitStack() as stack:
-        console.print(
-            f"{len(known.joints)} servos at {known.settings.port}: {_pairs(known.servos)}"
-        )
+        pairs = zip(known.servos.ids, known.joints, strict=True)
+        servos = ", ".join(f"{i} {name}" for i, name in pairs)
+        console.print(f"{len(known.joints)} servos at {known.settings.port}: {servos}")
         truth = None
         if options.dry_run:
             bus = truth = stack.enter_context(VirtualBus(emulator_config(known)))
@@ -661,7 +661,3 @@ def _told(state: ArmState, joints: Sequence[str]) -> dict[str, object]:
         "torque": by_joint(state.torque),
         "temperature": by_joint(state.temperature),
     }
-
-
-def _pairs(servos: ServoMap) -> str:
-    return ", ".join(f"{i} {name}" for i, name in zip(servos.ids, servos.joints, strict=True))
