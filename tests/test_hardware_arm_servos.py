@@ -23,29 +23,6 @@ from tests.test_hardware_supervisor import served
 STS = 777
 SMALL = sorted(number for number, one in servo_models().items() if one.counts_per_turn == 4096)
 
-# FT-SCS protocol manual (Feetech): instruction or status, and the bytes on the wire
-EXAMPLES = [
-    ((1, packets.PING, b""), "FF FF 01 02 01 FB"),
-    ((1, packets.READ, bytes([0x38, 2])), "FF FF 01 04 02 38 02 BE"),
-    ((1, 0, bytes([0x18, 5])), "FF FF 01 04 00 18 05 DD"),
-    (
-        (1, packets.WRITE, bytes([0x2A, 0, 8, 0, 0, 0xE8, 3])),
-        "FF FF 01 09 03 2A 00 08 00 00 E8 03 D5",
-    ),
-]
-
-
-@pytest.mark.parametrize(("content", "wire"), EXAMPLES)
-def test_feetech_packets_are_those_of_the_makers_examples(
-    content: tuple[int, int, bytes], wire: str
-) -> None:
-    """Catches a checksum that only our own two ends agree on."""
-    assert feetech_packets.packet(*content) == bytes.fromhex(wire)
-    found = feetech_packets.Parser().parse(bytes.fromhex(wire))
-    assert [(p.servo_id, p.instruction, p.parameters, p.is_intact) for p in found] == [
-        (*content, True)
-    ]
-
 
 @given(
     st.lists(st.binary(max_size=9), min_size=1, max_size=4),

@@ -318,6 +318,12 @@ def test_a_fault_comes_at_a_time_that_one_can_wait_for(after_s: float) -> None:
         Emulate(fault=["hot"], fault_after_s=after_s)
 
 
+def test_a_latency_is_refused_in_the_unit_of_its_option() -> None:
+    """Catches an error about another number than the one that somebody has typed."""
+    with pytest.raises(ConfigurationError, match=r"latency_ms must .* <= 1000 \[ms\], got -1"):
+        Emulate(latency_ms=-1.0)
+
+
 @pytest.mark.parametrize("model", [HardwareSettings, SafetyLimits, ArmSettings, ServoPlace])
 def test_every_number_of_a_mounting_file_has_its_unit_and_both_bounds(model: type[Model]) -> None:
     """Catches a setting without a bound, and a meaning with another unit than the errors."""

@@ -2,10 +2,7 @@
 for a reason."""
 
 import math
-import os
 import re
-import signal
-import threading
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -24,7 +21,7 @@ from elastic_env.hardware.safety.realtime import LONGEST_WAIT_S
 from elastic_env.hardware.safety.supervised_bus import SupervisedBus
 from elastic_env.hardware.settings import SafetyLimits
 from tests.busy import once_more
-from tests.emulators import wait_until_rest
+from tests.emulators import stopped, wait_until_rest
 from tests.test_hardware_safety import PATIENT, states
 from tests.test_hardware_supervisor import ENABLE, attached, served
 from tests.test_hardware_testbed import make_hardware
@@ -266,18 +263,9 @@ def test_a_supervisor_in_motion_may_be_silent_for_as_long_as_the_program(
         bus.enable(PATIENT.replace(hang_s=0.09))
         cycles(bus, 2)
         bus._answer_s = max(hang_s, supervised_bus._LEAST_ANSWER_S)
-        os.kill(bus.process_id, signal.SIGSTOP)
-        awake = threading.Timer(
-            10.0, os.kill, (bus.process_id, signal.SIGCONT)
-        )  # a test must not wait for ever
-        awake.start()
-        try:
-            with pytest.raises(
-                FaultError, match=r"did not answer within (\d+) ms and was ended; torque is off"
-            ) as caught:
-                cycles(bus, 1)
-        finally:
-            awake.cancel()
+        said = r"did not answer within (\d+) ms and was ended; torque is off"
+        with stopped(bus.process_id), pytest.raises(FaultError, match=said) as caught:
+            cycles(bus, 1)
     found = re.search(r"within (\d+) ms", str(caught.value))
     assert found is not None
     assert said_ms <= int(found[1]) <= said_ms + 1000 * LONGEST_WAIT_S

@@ -1,17 +1,21 @@
 """Packets, control tables, late replies: against the maker's examples, the SDK's own functions,
 and random bytes."""
 
+import io
 import itertools
 import math
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
+from dynamixel_sdk import COMM_SUCCESS
 from dynamixel_sdk.protocol2_packet_handler import Protocol2PacketHandler
 from hypothesis import given
 from hypothesis import strategies as st
 
 from elastic_env.core.errors import ConfigurationError
-from elastic_env.hardware.buses import packets
+from elastic_env.hardware.buses import feetech_packets, packets
 from elastic_env.hardware.buses.dynamixel_bus import DynamixelBus
 from elastic_env.hardware.buses.servo_bus import Status
 from elastic_env.hardware.buses.servo_models import (
@@ -19,12 +23,15 @@ from elastic_env.hardware.buses.servo_models import (
     NUM_BLOCKS,
     servo_model,
     servo_models,
+    torque_of_current,
 )
 from elastic_env.hardware.emulator.imu import attitude_packet, checksum
+from elastic_env.hardware.emulator.servos import EmulatedServo
 from elastic_env.hardware.errors import HardwareError
 from elastic_env.hardware.settings import SafetyLimits
 from elastic_env.joint.dynamixel import LOSS_NM, TORQUE_PER_CURRENT
 from elastic_env.joint.small_servos import SMALL_SERVOS
+from tests.lines import Loop
 
 # of the ROBOTIS e-manual, Protocol 2.0: instruction or status, and the bytes on the wire
 EXAMPLES = [
@@ -42,14 +49,31 @@ EXAMPLES = [
     ((1, 0x08, b""), "FF FF FD 00 01 03 00 08 2F 4E"),
 ]
 
+# FT-SCS protocol manual (Feetech), likewise
+FEETECH_EXAMPLES = [
+    ((1, packets.PING, b""), "FF FF 01 02 01 FB"),
+    ((1, packets.READ, bytes([0x38, 2])), "FF FF 01 04 02 38 02 BE"),
+    ((1, 0, bytes([0x18, 5])), "FF FF 01 04 00 18 05 DD"),
+    (
+        (1, packets.WRITE, bytes([0x2A, 0, 8, 0, 0, 0xE8, 3])),
+        "FF FF 01 09 03 2A 00 08 00 00 E8 03 D5",
+    ),
+]
 
-@pytest.mark.parametrize(("content", "wire"), EXAMPLES)
+
+@pytest.mark.parametrize(
+    ("protocol", "content", "wire"),
+    [
+        *((packets, *example) for example in EXAMPLES),
+        *((feetech_packets, *example) for example in FEETECH_EXAMPLES),
+    ],
+)
 def test_packets_are_those_of_the_makers_examples(
-    content: tuple[int, int, bytes], wire: str
+    protocol: Any, content: tuple[int, int, bytes], wire: str
 ) -> None:
     """Catches a wrong checksum, byte order or length in what both our ends would agree on."""
-    assert packets.packet(*content) == bytes.fromhex(wire)
-    found = packets.Parser().parse(bytes.fromhex(wire))
+    assert protocol.packet(*content) == bytes.fromhex(wire)
+    found = protocol.Parser().parse(bytes.fromhex(wire))
     assert [(p.servo_id, p.instruction, p.parameters, p.is_intact) for p in found] == [
         (*content, True)
     ]
@@ -59,6 +83,44 @@ def test_packets_are_those_of_the_makers_examples(
 def test_checksum_is_the_sdks(data: bytes) -> None:
     """Catches a table of ours that differs from the SDK's in a single entry."""
     assert packets.crc16(data) == Protocol2PacketHandler().updateCRC(0, list(data), len(data))
+
+
+@given(st.binary(max_size=60).filter(lambda data: b"\xff\xff\xfd" not in data))
+def test_packets_are_those_that_the_sdk_sends_and_reads(data: bytes) -> None:
+    """Catches a layout of ours that the maker's own program would not understand; the SDK's
+    stuffing is left out, which is wrong."""
+    sdk = Protocol2PacketHandler()
+    sent = bytearray()
+    line: Any = SimpleNamespace(
+        is_using=False,
+        clearPort=lambda: None,
+        writePort=lambda wire: sent.extend(wire) or len(wire),
+    )
+    length = packets.word(len(data) + 3)
+    sdk.txPacket(line, [0, 0, 0, 0, 7, *length, packets.WRITE, *data, 0, 0])
+    assert bytes(sent) == packets.packet(7, packets.WRITE, data)
+    coming = io.BytesIO(packets.status(7, 0, data))
+    line = SimpleNamespace(readPort=coming.read, isPacketTimeout=lambda: False)
+    received, result = sdk.rxPacket(line, False)
+    assert (result, bytes(received[9:-2])) == (COMM_SUCCESS, data)
+
+
+def test_an_echo_of_the_instruction_is_no_reply() -> None:
+    """Catches an adapter that echoes, whose echoes pass as answers or keep the answers out."""
+
+    class Echo(Loop):
+        def writePort(self, wire: bytes) -> int:  # noqa: N802
+            self._coming += bytes(wire)
+            return super().writePort(wire)
+
+    bus = DynamixelBus("loop")
+    bus.port = Echo([EmulatedServo(1, servo_model(1020), lambda *_: None)])  # type: ignore[assignment]
+    bus.attach([1])
+    bus.write_goal(1, 0.5)
+    states = bus.read_states(0.003)
+    assert states.is_fresh.all()
+    assert [servo.model_number for servo in bus.scan()] == [1020]
+    assert bus.num_retries == 0
 
 
 @given(st.lists(st.sampled_from([0xFF, 0xFD, 0x00, 0x55]), max_size=30).map(bytes))
@@ -171,9 +233,9 @@ def test_a_late_reply_is_never_taken_for_another_requests(lateness: list[float])
 
         requests = 0
 
-        def _transmit(self, servo_id: int, instruction: int, parameters: bytes) -> None:
+        def _transmit(self, servo_id: int, instruction: int, data: bytes) -> None:
             assert (servo_id, instruction) == (packets.BROADCAST, packets.SYNC_READ)
-            start, length = (int.from_bytes(parameters[i : i + 2], "little") for i in (0, 2))
+            start, length = (int.from_bytes(data[i : i + 2], "little") for i in (0, 2))
             reply = bytearray(length)
             at = position.address - start
             reply[at : at + position.size] = position.encode(self.requests)
@@ -221,14 +283,16 @@ def test_torque_line_runs_both_ways(number: int) -> None:
     """Catches a sign or an offset that emulator and driver would not share."""
     model = servo_model(number)
     for torque in (-52.5, -1.0, 0.5, 34.6):
-        assert model.torque(model.current(torque)) == pytest.approx(torque)
+        current = np.array(model.current(torque))
+        found = torque_of_current(current, model.torque_per_ampere, model.loss)
+        assert found == pytest.approx(torque)
 
 
 def test_the_torque_line_of_the_table_is_that_of_the_joint() -> None:
     """Catches a figure that is changed in one of two places."""
     model = servo_model(54024)
     assert (model.torque_per_ampere, model.loss) == (TORQUE_PER_CURRENT, LOSS_NM)
-    assert model.torque(0.3) == 0.0
+    assert torque_of_current(np.array(0.3), model.torque_per_ampere, model.loss) == 0.0
     assert model.largest_torque == LARGEST_TORQUE_NM
     for name in ("STS3215", "STS3250"):
         (small,) = (one for one in servo_models().values() if one.name == name)

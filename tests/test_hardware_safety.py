@@ -6,7 +6,6 @@ import pty
 import signal
 import subprocess
 import sys
-import threading
 import time
 import tty
 from collections.abc import Iterator
@@ -32,7 +31,7 @@ from elastic_env.hardware.safety.guard import Guard
 from elastic_env.hardware.safety.supervised_bus import SupervisedBus
 from elastic_env.hardware.settings import SafetyLimits
 from tests.busy import once_more
-from tests.emulators import wait_until_rest
+from tests.emulators import stopped, wait_until_free, wait_until_rest
 
 PERIOD_S = 0.004
 PATIENT = SafetyLimits(patience_cycles=10, hang_s=0.09)
@@ -258,7 +257,7 @@ def test_a_read_takes_no_more_than_it_asked_for_and_loses_nothing() -> None:
     cleared."""
     master, slave = pty.openpty()
     tty.setraw(slave)
-    port = Port(os.ttyname(slave))
+    port = Port(os.ttyname(slave), 1_000_000)
     port.open()
     try:
         os.write(master, bytes(range(30)))
@@ -372,19 +371,9 @@ def test_a_supervisor_that_hangs_is_ended_and_torque_switched_off(
     """Catches a program that waits for ever for an answer while a servo holds its last goal."""
     supervised.enable(PATIENT)
     emulator.events()
-    os.kill(supervised.process_id, signal.SIGSTOP)
-    awake = threading.Timer(
-        10.0, os.kill, (supervised.process_id, signal.SIGCONT)
-    )  # a test must not wait for ever
-    awake.start()
-    try:
-        with pytest.raises(
-            FaultError,
-            match=r"did not answer within .* ms and was ended; torque is off; end what else keeps",
-        ):
-            cycle(supervised, [0.0, 0.0])
-    finally:
-        awake.cancel()
+    said = r"did not answer within .* ms and was ended; torque is off; end what else keeps"
+    with stopped(supervised.process_id), pytest.raises(FaultError, match=said):
+        cycle(supervised, [0.0, 0.0])
     assert torque_events(emulator, 0)
     with pytest.raises(FaultError, match="torque is off"):
         cycle(supervised, [0.0, 0.0])
@@ -450,17 +439,7 @@ def test_torque_goes_off_whatever_ends_the_program(emulator: RunningEmulator, ho
     finally:
         program.kill()
         program.communicate()
-        _wait_until_free(emulator.port)
-
-
-def _wait_until_free(port: str) -> None:
-    deadline = time.monotonic() + 3.0
-    while time.monotonic() < deadline:
-        try:
-            with DynamixelBus(port):
-                return
-        except PortError:
-            time.sleep(0.01)
+        wait_until_free(emulator.port)
 
 
 @pytest.mark.slow
@@ -483,7 +462,7 @@ def test_two_buses_are_read_side_by_side(emulator: RunningEmulator) -> None:
 
 def test_wrong_model_number_is_refused_before_anything_is_written() -> None:
     """Catches registers of one model written to another."""
-    with RunningEmulator(EmulatorConfig(claimed_model_number=1021)) as strange:
+    with RunningEmulator(EmulatorConfig(registers={"model_number": 1021})) as strange:
         with (
             DynamixelBus(strange.port) as bus,
             pytest.raises(HardwareError, match="no control table for model number 1021"),

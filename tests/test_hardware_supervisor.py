@@ -60,7 +60,7 @@ class Line(DynamixelBus):
         self.motions = dict.fromkeys(ids, (0.0, 0.0, 0.0))
         self.servos = {
             i: EmulatedServo(
-                i, servo_model(number), self._note, None, partial(self.motions.__getitem__, i)
+                i, servo_model(number), self._note, partial(self.motions.__getitem__, i)
             )
             for i in ids
         }

@@ -348,7 +348,7 @@ def test_a_measurement_of_which_every_try_is_spoiled_is_not_met(
 ) -> None:
     """Catches a traceback that ends all other measurements with it."""
     monkeypatch.setattr(hardware_trials, "_end_once", lambda *_: None)
-    trial = hardware_trials.killed(0.02)
+    trial = hardware_trials.TRIALS["killed"](0.02)
     assert not trial.is_met
     assert "all 2 tries had stopped" in trial.measured
 

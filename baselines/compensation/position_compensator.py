@@ -140,6 +140,7 @@ class PositionCompensator:
 
     Attributes:
         joints: Names of the joints, in the order of all arrays.
+        settings: Of each joint by name, as `stiffness` says them.
         constants: What it computes with.
         clipped: Which joints of the last command met a limit, (n,).
         needed: Largest offsets that the weight needs within the joint ranges, (n,) [rad].
@@ -192,6 +193,7 @@ class PositionCompensator:
             named = stiffness if isinstance(stiffness, Mapping) else ()
             joints = commanded_hinges(model, named)
         settings = _read_stiffness(model, stiffness, joints, is_held_left_out=is_free)
+        self.settings = settings
         self.joints = tuple(settings)
         own = list(settings.values())
         lowest, highest = joint_ranges(model, self.joints)
@@ -200,7 +202,7 @@ class PositionCompensator:
         limits = CommandLimits(limit_rad=limit_rad, ramp_s=ramp_s, period_s=period_s)
         self.constants = CompensatorConstants(
             model=model,
-            body=RigidBody(model, self.joints, _held(model, self.joints)),
+            body=RigidBody(model, self.joints, held_positions(model, self.joints)),
             tip=max(int(model.jnt_bodyid[model.joint(name).id]) for name in self.joints),
             compliance=compliance,
             of_command=compliance + 1.0 / gains,
@@ -217,7 +219,10 @@ class PositionCompensator:
         )
         self._said: set[str] = set()
         self.reset()
-        self.needed = self.constants.of_command * self._most_passed(self._heaviest())
+        heaviest = self._heaviest()
+        if self.constants.friction is not None:
+            heaviest = self.constants.friction.most_passed(heaviest)
+        self.needed = self.constants.of_command * heaviest
         if (self.needed > limits.limit_rad).any():
             self._warn_of_offset(self.needed, "at some pose within the joint ranges")
 
@@ -418,12 +423,6 @@ class PositionCompensator:
             torque + self.constants.viscous * rate, rate, self._rubbed
         )
 
-    def _most_passed(self, torque: Array) -> Array:
-        """Largest torque that is passed to links under loads of either sign, (n,) [N·m]."""
-        if self.constants.friction is None:
-            return torque
-        return self.constants.friction.most_passed(torque)
-
     def _passed_at_rest(self, q: Array) -> Array:
         """Torque that is passed to links at rest, (..., n) [rad] to (..., n) [N·m]."""
         torque = self.constants.body.gravity_torque(q)
@@ -537,7 +536,10 @@ class PositionCompensator:
     def _checked(self, name: str, given: Any, unit: str) -> Array:
         """An argument of a public method, as (n,)."""
         n = len(self.joints)
-        values = _array(given)
+        try:
+            values = np.asarray(given, dtype=np.float64)
+        except (TypeError, ValueError):
+            values = np.empty(0)
         if values.shape != (n,):
             is_array = isinstance(given, np.ndarray)
             size = f", an array of shape {values.shape}" if is_array else ""
@@ -577,7 +579,7 @@ def _warn(message: str) -> None:
     warnings.warn(message, stacklevel=level)
 
 
-def _held(model: mujoco.MjModel, joints: Sequence[str]) -> dict[int, float]:
+def held_positions(model: mujoco.MjModel, joints: Sequence[str]) -> dict[int, float]:
     """Positions of the joints that are not commanded, by their number [rad], [m]."""
     home = home_of(model)
     others = [j for j in range(model.njnt) if model.joint(j).name not in joints]
@@ -777,11 +779,3 @@ def _by_joint(name: str, given: Any, joints: Sequence[str]) -> Mapping[str, Any]
 
 def _joint_names(model: mujoco.MjModel) -> list[str]:
     return [name for j in range(model.njnt) if (name := model.joint(j).name)]
-
-
-def _array(given: Any) -> Array:
-    """The argument as an array; empty where it is none of numbers."""
-    try:
-        return np.asarray(given, dtype=np.float64)
-    except (TypeError, ValueError):
-        return np.empty(0)

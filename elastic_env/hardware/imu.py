@@ -20,7 +20,7 @@ from typing import Any, Literal
 from elastic_env.hardware.buses.port_lock import lock_port
 from elastic_env.hardware.errors import HardwareError
 from elastic_env.hardware.safety.guard import is_outside
-from elastic_env.hardware.safety.processes import end_child, start_child
+from elastic_env.hardware.safety.processes import Process, end_child, start_child
 
 Axis = Literal["roll", "pitch", "yaw"]
 
@@ -163,9 +163,9 @@ class AttitudeStream(AbstractContextManager["AttitudeStream"]):
         self._oldest_s = oldest_s
         self._plausible = PlausibleAttitudes(oldest_s)
         self._lock: int | None = lock_port(port)
-        self._process: subprocess.Popen[str] | None = None
+        self._process: Process | None = None
         try:
-            self._process, self._shared = _start(port, baudrate)
+            self._process = self._start(baudrate)
             deadline = time.monotonic() + _WAIT_S
             while self._shared.get() is None:
                 if self._process.poll() is not None or time.monotonic() > deadline:
@@ -207,6 +207,17 @@ class AttitudeStream(AbstractContextManager["AttitudeStream"]):
     def __exit__(self, *_: object) -> None:
         self.close()
 
+    def _start(self, baudrate: int) -> Process:
+        """Start the reader, whose memory is mapped first."""
+        file = SharedSample.file()
+        try:
+            self._shared = SharedSample(file)
+            pipes: Any = dict.fromkeys(("stdin", "stderr"), subprocess.PIPE)
+            arguments = (str(file), self.port, str(baudrate))
+            return start_child(_READER, *arguments, pass_fds=[file], **pipes)
+        finally:
+            os.close(file)
+
     def _silence(self, last: Attitude | None = None) -> AttitudeError:
         """The error of a stream that is silent, after a last sample or from the beginning."""
         process = self._process
@@ -225,19 +236,3 @@ class AttitudeStream(AbstractContextManager["AttitudeStream"]):
             f"{1e3 * (time.monotonic() - last.time_s):.0f} ms, {1e3 * self._oldest_s:.0f} ms are "
             "allowed (imu_oldest_s); look at its cable and its data rate"
         )
-
-
-def _start(port: str, baudrate: int) -> tuple["subprocess.Popen[str]", SharedSample]:
-    """Start the reader of a port; the process, and the memory that it writes."""
-    file = SharedSample.file()
-    try:
-        pipes: Any = dict.fromkeys(("stdin", "stderr"), subprocess.PIPE)
-        arguments = (str(file), port, str(baudrate))
-        reader = start_child(_READER, *arguments, pass_fds=[file], **pipes)
-        try:
-            return reader, SharedSample(file)
-        except BaseException:
-            end_child(reader, _END_S)
-            raise
-    finally:
-        os.close(file)

@@ -9,6 +9,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -34,7 +35,7 @@ from elastic_env.hardware.safety.realtime import (
 from elastic_env.hardware.safety.supervised_bus import SupervisedBus
 from elastic_env.hardware.settings import PATIENT_LIMITS, SafetyLimits
 from elastic_env.robots.testbed.config import TestbedConfig
-from tests.emulators import wait_until_rest
+from tests.emulators import wait_until_free, wait_until_rest
 from tests.hardware_trials.wave import PERIOD_S, goal
 
 _USB_LATENCY = Faults(latency_s=1e-3)
@@ -56,6 +57,7 @@ every adapter can."""
 _PAIR = (1, 2)
 _MODEL = servo_model(54024)
 _UNIT = _MODEL.position_unit
+_OFF = ("torque_enable", 0)
 
 Event = tuple[float, int, str, int]
 
@@ -409,67 +411,19 @@ def _off_after_fault(events: Sequence[Event], emulator: RunningEmulator) -> list
     asked = max((t for t, _, name, _ in events if name == "present_position"), default=None)
     if asked is None:
         return [math.inf] if any(emulator.state()["torque_on"]) else []
-    off = [
-        t for t, _, name, value in events if name == "torque_enable" and value == 0 and t >= asked
-    ]
+    off = [t for t, *_, name, value in events if (name, value) == _OFF and t >= asked]
     return [max(min(off, default=math.inf) - asked - _REPLY_TIMEOUT_S, 0.0)]
 
 
-def killed(share: float) -> Trial:
-    """SIGKILL of the program."""
-    return _ended(
-        "killed", "SIGKILL of the program: torque off within 100 ms", share, _kill(signal.SIGKILL)
-    )
-
-
-def hangs(share: float) -> Trial:
-    """A program that hangs: it is stopped in the middle of whatever it does."""
-    return _ended(
-        "hangs", "the program hangs: torque off within 100 ms", share, _kill(signal.SIGSTOP)
-    )
-
-
-def interrupted(share: float) -> Trial:
-    """Ctrl-C, which nearly always finds the program waiting for a read."""
-    return _ended("interrupted", "SIGINT during a read: torque off", share, _kill(signal.SIGINT))
-
-
-def supervisor_ended(share: float) -> Trial:
-    """SIGTERM of the supervisor itself, during a read or a wait."""
-
-    def end(_: Any, supervisor: int) -> None:
-        os.kill(supervisor, signal.SIGTERM)
-
-    return _ended(
-        "supervisor-ended", "SIGTERM of the supervisor: torque off within 100 ms", share, end
-    )
-
-
-def supervisor_killed(share: float) -> Trial:
-    """SIGKILL of the supervisor: the program switches torque off in its place."""
-
-    def end(_: Any, supervisor: int) -> None:
-        os.kill(supervisor, signal.SIGKILL)
-
-    return _ended(
-        "supervisor-killed", "SIGKILL of the supervisor: torque off within 100 ms", share, end
-    )
-
-
-def supervisor_hangs(share: float) -> Trial:
-    """SIGSTOP of the supervisor: the program ends it and switches torque off in its place."""
-
-    def end(_: Any, supervisor: int) -> None:
-        os.kill(supervisor, signal.SIGSTOP)
-
-    return _ended("supervisor-hangs", "the supervisor hangs: torque off within 100 ms", share, end)
-
-
-def _kill(number: signal.Signals) -> Callable[[Any, int], None]:
+def _signal_program(number: signal.Signals) -> Callable[[Any, int], None]:
     return lambda program, _: program.send_signal(number)
 
 
-def _ended(name: str, required: str, share: float, end: Callable[[Any, int], None]) -> Trial:
+def _signal_supervisor(number: signal.Signals) -> Callable[[Any, int], None]:
+    return lambda _, supervisor: os.kill(supervisor, number)
+
+
+def _ended(name: str, required: str, end: Callable[[Any, int], None], share: float) -> Trial:
     """Start a motion, end it in some way at a random moment, and see when torque goes off."""
     number = _times(50, share)
     generator = np.random.default_rng(0)
@@ -530,33 +484,17 @@ def _end_once(
             return None
         begin = time.monotonic()
         end(program, supervisor)
-        time.sleep(2.0 * _TORQUE_OFF_S)
-        off = [
-            t for t, _, name, value in emulator.events() if name == "torque_enable" and value == 0
-        ]
-        for _ in range(20):  # a program that was itself to switch torque off is slower
-            if off:
-                break
+        time.sleep(_TORQUE_OFF_S)
+        for _ in range(21):  # a program that was itself to switch torque off is slower
             time.sleep(_TORQUE_OFF_S)
-            off = [
-                t
-                for t, _, name, value in emulator.events()
-                if name == "torque_enable" and value == 0
-            ]
-        return min(off, default=float("inf")) - begin
+            events = emulator.events()
+            if off := [t for t, *_, name, value in events if (name, value) == _OFF]:
+                return min(off) - begin
+        return math.inf
     finally:
         program.kill()
         program.communicate()
-        _wait_until_free(emulator.port)
-
-
-def _wait_until_free(port: str) -> None:
-    """Wait until the supervisor of a program that has ended has given the port back."""
-    deadline = time.monotonic() + 5.0
-    while time.monotonic() < deadline:
-        with contextlib.suppress(PortError), DynamixelBus(port):
-            return
-        time.sleep(0.005)
+        wait_until_free(emulator.port)
 
 
 def unplugged(share: float) -> Trial:
@@ -641,15 +579,37 @@ def second_program(share: float) -> Trial:
     )
 
 
+_ENDINGS = {
+    "killed": (
+        "SIGKILL of the program: torque off within 100 ms",
+        _signal_program(signal.SIGKILL),
+    ),
+    "hangs": (
+        "the program hangs: torque off within 100 ms",
+        _signal_program(signal.SIGSTOP),
+    ),
+    "interrupted": (
+        "SIGINT during a read: torque off",
+        _signal_program(signal.SIGINT),
+    ),
+    "supervisor-ended": (
+        "SIGTERM of the supervisor: torque off within 100 ms",
+        _signal_supervisor(signal.SIGTERM),
+    ),
+    "supervisor-killed": (
+        "SIGKILL of the supervisor: torque off within 100 ms",
+        _signal_supervisor(signal.SIGKILL),
+    ),
+    "supervisor-hangs": (
+        "the supervisor hangs: torque off within 100 ms",
+        _signal_supervisor(signal.SIGSTOP),
+    ),
+}
+"""Ends of a motion at a random moment: what is required, and how it ends."""
 TRIALS: dict[str, Callable[[float], Trial]] = {
     "second-program": second_program,
     "header-positions": header_positions,
-    "killed": killed,
-    "hangs": hangs,
-    "interrupted": interrupted,
-    "supervisor-ended": supervisor_ended,
-    "supervisor-killed": supervisor_killed,
-    "supervisor-hangs": supervisor_hangs,
+    **{name: partial(_ended, name, *ending) for name, ending in _ENDINGS.items()},
     "unplugged": unplugged,
     "faults": faults,
     "loop": loop,

@@ -241,8 +241,8 @@ class Emulate(Model):
     """Share of replies with a flipped bit."""
     truncated: float = 0.0
     """Share of replies that end too early."""
-    latency_ms: float = 1.0
-    """Latency timer of the emulated USB adapter."""
+    latency_ms: float = quantity("ms", 1.0, ge=0, le=1000)
+    """Latency timer of the emulated USB adapter [ms]."""
     fault: list[str] = []
     """Faults that begin later: overload, hot, silent, same_id, unplugged, imu_silent, imu_nan,
     imu_inf, imu_out_of_range, imu_frozen."""

@@ -18,6 +18,7 @@ from rich.table import Table
 from rich.text import Text
 
 from baselines import PositionCompensator
+from baselines.compensation.position_compensator import held_positions
 from baselines.identification.servo_log import known_loads
 from elastic_env.core.config import Locator, Model, load_yaml, quantity, read_mapping
 from elastic_env.core.errors import ConfigurationError
@@ -30,28 +31,18 @@ from elastic_env.hardware.emulator.joints import EmulatedArm
 from elastic_env.hardware.emulator.launch import EmulatorConfig
 from elastic_env.hardware.emulator.virtual import VirtualBus
 from elastic_env.hardware.errors import HardwareError
-from elastic_env.hardware.live.arm import (
-    Arm,
-    ArmState,
-    Compensator,
-    Weighed,
-    answers_yes,
-    require_consent,
-    weigh,
-    wrong_sign,
-)
+from elastic_env.hardware.live.arm import Arm, ArmState, Compensator, Weighed, weigh, wrong_sign
+from elastic_env.hardware.live.consent import answers_yes, require_consent
 from elastic_env.hardware.live.target_sources import Poses, Socket, Stream, Targets
 from elastic_env.hardware.safety import realtime
 from elastic_env.hardware.safety.checks import check_bus
 from elastic_env.hardware.safety.supervised_bus import SupervisedBus
 from elastic_env.hardware.settings import PATIENT_LIMITS
-from elastic_env.joint.joint_settings import JointSettings, read_joints
+from elastic_env.joint.joint_settings import JointSettings
 from elastic_env.joint.model_file import compiled_model
 from elastic_env.joint.small_servos import SMALL_SERVOS
-from elastic_env.rigid.rigid_body import RigidBody
 from elastic_env.rigid.tree.end_effector import EndEffector, outermost_body
 from elastic_env.robots.robot.joints import STIFF_OVER_SERVO
-from elastic_env.world.robot_model import joint_ranges
 from train.runs.console import can_redraw, make_table, print_files
 from train.runs.folders import run_folder
 
@@ -160,15 +151,12 @@ class KnownArm:
                 " stiffness and position_gain in N·m/rad"
             )
         self.servos = self.settings.servos(self.joints)
-        self.lowest, self.highest = joint_ranges(self.model, self.joints)
+        self.lowest = self.compensator.constants.lowest
+        self.highest = self.compensator.constants.highest
         self.ranges = self.servos.servo_ranges(self.lowest, self.highest, self.settings.limits)
-        held = {
-            j: float(self.model.qpos0[self.model.jnt_qposadr[j]])
-            for j in range(self.model.njnt)
-            if self.model.joint(j).name not in self.joints
-        }
-        self.links = RigidBody(self.model, self.joints, held)
+        self.links = self.compensator.constants.body
         tool = options.end_effector or outermost_body(self.model)
+        held = held_positions(self.model, self.joints)
         self.tool = EndEffector(self.model, self.joints, tool, held)
 
     def tip_error(self, desired: Array, links: Array) -> float:
@@ -180,12 +168,6 @@ class KnownArm:
         """Middles of the joints' ranges, (n,) [rad]; where one has none, zero."""
         ends = np.stack([self.lowest, self.highest])
         return np.where(np.isfinite(ends).all(axis=0), ends, 0.0).mean(axis=0)
-
-    @property
-    def joint_settings(self) -> dict[str, JointSettings]:
-        """Settings of the joints by name."""
-        found = read_joints(self.mapping, self.joints, _others(self.model, self.joints))
-        return {name: own for name, own in found.items() if own is not None}
 
 
 def require_known_servos(settings: ArmSettings, model: mujoco.MjModel) -> None:
@@ -245,9 +227,9 @@ def move_arm(
     options = known.options
     recorded = options.model_dump(mode="json", exclude={"output"})
     with contextlib.ExitStack() as stack:
-        console.print(
-            f"{len(known.joints)} servos at {known.settings.port}: {_pairs(known.servos)}"
-        )
+        pairs = zip(known.servos.ids, known.joints, strict=True)
+        servos = ", ".join(f"{i} {name}" for i, name in pairs)
+        console.print(f"{len(known.joints)} servos at {known.settings.port}: {servos}")
         truth = None
         if options.dry_run:
             bus = truth = stack.enter_context(VirtualBus(emulator_config(known)))
@@ -362,7 +344,7 @@ def _play(
 def stiffen_joints(known: KnownArm) -> dict[str, Any]:
     """Rigid joints whose servo gives way, which are not simulated, made stiff, by name."""
     found: dict[str, Any] = {}
-    for joint, own in known.joint_settings.items():
+    for joint, own in known.compensator.settings.items():
         gain = own.servo.sagging_gain(joint)
         if own.is_rigid and np.isfinite(gain):
             found[joint] = own.replace(stiffness=STIFF_OVER_SERVO * gain).model_dump(
@@ -445,15 +427,15 @@ def _check_joints(arm: Arm, known: KnownArm, console: Console) -> None:
         if weighed_torque < _TOLD_NM:
             _ask(arm, known, joint, weighed[-1].first)
     arm.hold()  # while tables are drawn
-    require_signs(known.servos, weighed, known.links.gravity_torque, known.joint_settings)
+    require_signs(known.servos, weighed, known.links.gravity_torque, known.compensator.settings)
     rows = []
     for joint, own in enumerate(weighed):
         name = known.joints[joint]
         load = float(known.links.gravity_torque(own.theta)[joint])
-        gain = known.joint_settings[name].servo.sagging_gain(name)
+        gain = known.compensator.settings[name].servo.sagging_gain(name)
         is_far = max(own.gain / gain, gain / own.gain) > _FAR_GAIN if own.gain > 0.0 else False
         remark = "" if abs(load) >= _TOLD_NM else "light"
-        if abs(own.torque - load) > _explained(known.joint_settings[name], load, gain):
+        if abs(own.torque - load) > _explained(known.compensator.settings[name], load, gain):
             remark = "load"
         if is_far:
             remark = "k_p"
@@ -679,12 +661,3 @@ def _told(state: ArmState, joints: Sequence[str]) -> dict[str, object]:
         "torque": by_joint(state.torque),
         "temperature": by_joint(state.temperature),
     }
-
-
-def _pairs(servos: ServoMap) -> str:
-    return ", ".join(f"{i} {name}" for i, name in zip(servos.ids, servos.joints, strict=True))
-
-
-def _others(model: mujoco.MjModel, joints: Sequence[str]) -> list[str]:
-    names = [model.joint(j).name for j in range(model.njnt)]
-    return [name for name in names if name not in joints]

@@ -48,13 +48,13 @@ class Compensate(OnArm):
 
     def run(self, console: Console) -> None:
         """Check, move, log."""
-        if self.targets is None and self.listen is None:
+        if (self.targets is None) == (self.listen is None):
             raise ConfigurationError(
                 "name targets: --targets FILE.csv, --targets - for standard input, or --listen PORT"
             )
         known = KnownArm(self, self.joints, self.limit_rad)
-        if self.listen is None and str(self.targets) != "-":
-            self._targets(known, known.middle)  # a bad file is told before anything moves
+        # a bad file and a port that is taken are told before anything moves
+        self._targets(known, known.middle).close()
         compensator = Plain(known.compensator) if self.plain else known.compensator
         move_arm(known, compensator, lambda start: self._targets(known, start), console)
 

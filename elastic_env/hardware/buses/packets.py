@@ -48,7 +48,7 @@ RATES = (3_000_000, 1_000_000, 57_600, 115_200, 2_000_000, 4_000_000)
 RANGE_OF_RATES = {"ge": 9_600, "le": 10_500_000}
 """Bounds of servos and IMU, by their manuals [bit/s]."""
 LONGEST_PACKET = 1024
-"""Longest packet of the SDK [bytes]."""
+"""Longest packet that a parser waits for [bytes]."""
 
 _POLYNOMIAL = 0x8005
 _STUFFED = b"\xff\xff\xfd"

@@ -4,8 +4,8 @@ A state is read as one block per servo. A request asks for a length (`ServoModel
 of the last ones still awaits. So a reply that comes late is known as old and left out. Temperatures
 may lie farther off and change slowly: only every 25th request is for a block that reaches as far.
 
-What differs from make to make is in `dynamixel_bus` and `feetech_bus`: packets, pings, and the
-meaning of a status.
+What differs from make to make is in `dynamixel_bus` and `feetech_bus`: packets, who answers a ping,
+and the meaning of a status.
 """
 
 from abc import ABC, abstractmethod
@@ -21,6 +21,7 @@ from elastic_env.core.signals import Array
 from elastic_env.hardware.buses import packets, servo_models
 from elastic_env.hardware.buses import port as ports
 from elastic_env.hardware.buses.bus import TEMPERATURE_CYCLES, Condition, ServoInfo, States
+from elastic_env.hardware.buses.packets import Packet
 from elastic_env.hardware.buses.port import bus_gone
 from elastic_env.hardware.buses.servo_models import Protocol, ServoModel
 from elastic_env.hardware.errors import BusGoneError, HardwareError, ReplyError
@@ -29,6 +30,8 @@ _TRIES = 3
 _QUIET_S = 0.03
 _REPLY_TIMEOUT_S = 0.05
 _WATCHDOG_COUNTS = 3  # of 20 ms
+_PING_S = 3e-3
+"""Time that each possible servo has to answer a ping to all [s]."""
 _LOWER_S = 0.02
 """Between two steps of the torque when it is lowered [s]."""
 
@@ -50,6 +53,8 @@ class Status(NamedTuple):
 
 DAMAGED = Status(servo_id=-1, error=0, has_alert=False, data=b"", is_intact=False)
 """A reply that is not intact."""
+STRANGE = DAMAGED._replace(is_intact=True)
+"""A packet that is no reply."""
 
 
 class ServoBus(ABC):
@@ -67,6 +72,10 @@ class ServoBus(ABC):
     protocol: ClassVar[Protocol]
     rates: ClassVar[tuple[int, ...]]
     """Usual rates, the likeliest first [bit/s]."""
+    packet: ClassVar[Callable[[int, int, bytes], bytes]]
+    """An instruction as it goes over the wire, of id, number and parameters."""
+    parser: ClassVar[type[packets.Parser]]
+    """Finds replies in what comes back."""
     position_mode: ClassVar[int]
     """Operating mode in which a servo follows goal positions."""
     full_replies: ClassVar[int]
@@ -95,6 +104,10 @@ class ServoBus(ABC):
         """Blocks that the last requests asked for; None where all servos answered."""
         self._torque_lines: Array = np.zeros((2, 0))
         """Torque per current [N·m/A] and what is lost [N·m], (2, n)."""
+        self._parser = self.parser()
+        self._received: deque[Packet] = deque()
+        self._is_noise = False
+        """True where bytes have come that make no packet."""
         self._full_efforts: dict[int, int] = {}
         """Largest value of the register that limits the torque, by id [count]."""
 
@@ -122,17 +135,24 @@ class ServoBus(ABC):
         """Ids of the attached servos, in order."""
         return tuple(self.models)
 
-    @abstractmethod
     def scan(self) -> list[ServoInfo]:
         """All servos that answer a ping to all, by id."""
+        self._transmit(packets.BROADCAST, packets.PING, b"")
+        wire_ms = self.port.tx_time_per_byte * (self.status_bytes + self.ping_bytes)
+        self.port.setPacketTimeoutMillis(packets.LARGEST_ID * (wire_ms + 1e3 * _PING_S))
+        answers: dict[int, bytes] = {}
+        while (reply := self._receive()) is not None:
+            if reply.is_intact and len(reply.data) == self.ping_bytes:
+                answers[reply.servo_id] = reply.data
+        return [self._identify(*answer) for answer in sorted(answers.items())]
 
-    @abstractmethod
     def ping(self, servo_id: int) -> ServoInfo:
         """Model number and firmware of one servo.
 
         Raises:
             ReplyError: It does not answer.
         """
+        return self._identify(servo_id, self.knock(servo_id))
 
     def knock(self, servo_id: int) -> bytes:
         """One request and its answer, as short as there are.
@@ -143,12 +163,40 @@ class ServoBus(ABC):
         return self._request(servo_id, packets.PING, b"", length=self.ping_bytes)
 
     @abstractmethod
-    def _transmit(self, servo_id: int, instruction: int, data: bytes) -> None:
-        """Send an instruction, and forget what has come before."""
+    def _identify(self, servo_id: int, answer: bytes) -> ServoInfo:
+        """Who a servo is, by its answer to a ping."""
 
     @abstractmethod
+    def _status(self, packet: Packet) -> Status:
+        """What an intact packet says."""
+
+    def _transmit(self, servo_id: int, instruction: int, data: bytes) -> None:
+        """Send an instruction, and forget what has come before."""
+        wire = type(self).packet(servo_id, instruction, data)
+        self._parser = self.parser()
+        self._received.clear()
+        self._is_noise = False
+        with bus_gone(self.name):
+            self.port.clearPort()
+            sent = self.port.writePort(wire)
+        if sent != len(wire):
+            taken = f"{sent} of {len(wire)} bytes were taken"
+            raise ReplyError(f"cannot send at {self.name}: {taken}")
+
     def _receive(self) -> Status | None:
         """The next reply; None if none comes in time."""
+        with bus_gone(self.name):
+            while not self._received:
+                if self.port.isPacketTimeout():
+                    was_noise = self._is_noise
+                    self._is_noise = False
+                    return DAMAGED if was_noise else None
+                data = self.port.readPort(4096)
+                self._is_noise |= bool(data)
+                self._received.extend(self._parser.parse(data))
+        self._is_noise = False
+        found = self._received.popleft()
+        return self._status(found) if found.is_intact else DAMAGED
 
     def _place(self, *numbers: int) -> bytes:
         """Address of registers, and their length, as an instruction names them."""
@@ -224,7 +272,6 @@ class ServoBus(ABC):
         for servo_id, value in values.items():
             data += bytes([servo_id]) + register.encode(value)
         self._transmit(packets.BROADCAST, packets.SYNC_WRITE, data)
-        self.port.release()
 
     def read_position(self, servo_id: int) -> float:
         """Present position of one servo [rad]."""
@@ -306,7 +353,6 @@ class ServoBus(ABC):
         """
         # nobody confirms a packet to all; a second one costs nothing
         for _ in range(2):
-            self.port.release()
             self.write_all("torque_enable", dict.fromkeys(self.ids, 0))
         # the next program must not find a servo without strength
         self.limit_effort(1.0)
@@ -416,7 +462,6 @@ class ServoBus(ABC):
 
     def _wait_for_silence(self) -> None:
         with bus_gone(self.name):
-            self.port.release()
             deadline = self.port.clock.monotonic() + 10 * _QUIET_S
             end = self.port.clock.monotonic() + _QUIET_S
             while self.port.clock.monotonic() < min(end, deadline):
@@ -439,11 +484,6 @@ class BusGroup:
     def servos(self) -> list[tuple[ServoBus, int]]:
         """Bus and id of each servo."""
         return [(bus, servo_id) for bus in self.buses for servo_id in bus.ids]
-
-    @property
-    def names(self) -> list[str]:
-        """The servos' names in messages."""
-        return [servo_name(bus, servo_id) for bus, servo_id in self.servos]
 
     def write_goals(self, angles: Array) -> None:
         """Command all servos, (n,) [rad]."""

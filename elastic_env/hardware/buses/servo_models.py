@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Literal, NoReturn, TypeVar
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import TypeAdapter
 
 from elastic_env.core.errors import unknown_name
@@ -186,14 +185,6 @@ class ServoModel:
     def count(self, angle: float) -> int:
         """Count of position of an angle [rad]."""
         return round(angle / self.position_unit) + self.zero_count
-
-    def torque(self, current: npt.ArrayLike) -> Array:
-        """Torque at the output for signed currents, (...) [A] to (...) [N·m].
-
-        Zero where the current only meets the losses.
-        """
-        amperes = np.asarray(current, dtype=np.float64)
-        return torque_of_current(amperes, self.torque_per_ampere, self.loss)
 
     def current(self, torque: float) -> float:
         """Signed current [A] for a torque at the output [N·m]."""

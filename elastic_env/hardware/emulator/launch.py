@@ -1,14 +1,16 @@
 """An emulator in a process of its own, as programs and tests start it, and its faults."""
 
 import json
+import os
 import subprocess
 import termios
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, suppress
 from typing import Any
 
 import numpy as np
 
 from elastic_env.core.config import Model, quantity
+from elastic_env.core.errors import ConfigurationError
 from elastic_env.hardware.buses import packets
 from elastic_env.hardware.buses.protocols import BUSES
 from elastic_env.hardware.buses.servo_models import servo_model
@@ -98,8 +100,6 @@ class EmulatorConfig(Model):
 
     model_number: int = 54024
     """Type of the servos."""
-    claimed_model_number: int | None = None
-    """Model number that they report, if it is to be a wrong one."""
     ids: tuple[int, ...] = (1,)
     """Their ids."""
     registers: dict[str, int] = {}
@@ -172,8 +172,12 @@ class RunningEmulator(AbstractContextManager["RunningEmulator"]):
         return self._request({"state": True})
 
     def wait(self) -> None:
-        """Wait until it ends by itself, or an interrupt comes."""
-        self._process.wait()
+        """Wait for an interrupt.
+
+        Raises:
+            ElasticError: It has ended by itself.
+        """
+        self._receive()
 
     def close(self) -> None:
         """End it."""
@@ -184,8 +188,8 @@ class RunningEmulator(AbstractContextManager["RunningEmulator"]):
 
     def _request(self, request: dict[str, Any]) -> Any:
         assert self._process.stdin is not None
-        self._process.stdin.write(json.dumps(request) + "\n")
-        self._process.stdin.flush()
+        with suppress(BrokenPipeError):  # what it has said at its end tells why
+            os.write(self._process.stdin.fileno(), json.dumps(request).encode() + b"\n")
         return self._receive()
 
     def _receive(self) -> Any:
@@ -194,7 +198,10 @@ class RunningEmulator(AbstractContextManager["RunningEmulator"]):
         if not line:
             code = self._process.wait()
             raise HardwareError(f"the emulator ended with exit code {code}")
-        return json.loads(line)
+        answer = json.loads(line)
+        if "error" in answer:
+            raise ConfigurationError(answer["error"])
+        return answer
 
     def _take_ports(self, ports: dict[str, str]) -> None:
         self.port = ports["port"]

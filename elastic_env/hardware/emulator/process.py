@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from elastic_env.core.errors import ConfigurationError
 from elastic_env.hardware.buses import packets
 from elastic_env.hardware.buses.servo_models import servo_model
 from elastic_env.hardware.clock import Clock
@@ -119,13 +120,12 @@ class Emulator:
             self._joints = Joints(config.testbed, len(config.ids), now)
         else:
             self._joints = ArmJoints(config.arm, now)
-        claimed = config.claimed_model_number
         self._servos: list[EmulatedServo] = []
         for index, servo_id in enumerate(config.ids):
             motion = partial(self._joints.motion, index)
             note = partial(self._note, index)
-            shared = (note, claimed, motion, config.registers)
-            self._servos.append(EmulatedServo(servo_id, model, *shared))
+            servo = EmulatedServo(servo_id, model, note, motion, config.registers)
+            self._servos.append(servo)
         self._bus = EmulatedBus(self._servos)
         self._imu = EmulatedImu(config, now)
         self._parser = self._bus.wire.parser()
@@ -304,4 +304,7 @@ def _answer(emulator: Emulator, request: dict[str, Any]) -> Any:
 
 
 if __name__ == "__main__":
-    serve(EmulatorConfig.model_validate_json(sys.argv[1]))
+    try:
+        serve(EmulatorConfig.model_validate_json(sys.argv[1]))
+    except ConfigurationError as error:
+        print(json.dumps({"error": str(error)}), flush=True)

@@ -26,7 +26,6 @@ class EmulatedServo:
         servo_id: Its id.
         model: Its type, by which its registers and units go.
         notify: Called with id, register and value when torque, goal or watchdog change.
-        model_number: Number that it claims, if another one than its type's.
         motion: Gives what it measures: angle, its rate and torque [rad], [rad/s], [N·m].
         registers: Values that differ from the factory's, by name [count].
     """
@@ -34,7 +33,6 @@ class EmulatedServo:
     servo_id: int
     model: ServoModel
     notify: Notify
-    model_number: int | None = None
     motion: Callable[[], tuple[float, float, float]] = lambda: (0.0, 0.0, 0.0)
     registers: Mapping[str, int] = field(default_factory=dict)
     _memory: bytearray = field(init=False)
@@ -44,7 +42,7 @@ class EmulatedServo:
         self._memory = bytearray(self.model.table.size)
         for register in self.model.table.values():
             self[register.name] = register.initial
-        self["model_number"] = self.model_number or self.model.number
+        self["model_number"] = self.model.number
         self["firmware_version"] = _FIRMWARE
         self["id"] = self.servo_id
         self["return_delay_time"] = 0

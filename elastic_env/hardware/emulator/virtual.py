@@ -16,6 +16,7 @@ from elastic_env.hardware import errors
 from elastic_env.hardware.buses.protocols import BUSES
 from elastic_env.hardware.buses.servo_bus import ServoBus
 from elastic_env.hardware.buses.servo_models import servo_model
+from elastic_env.hardware.clock import Clock
 from elastic_env.hardware.emulator.launch import EmulatorConfig
 from elastic_env.hardware.emulator.process import Emulator, Terminal
 from elastic_env.hardware.safety.realtime import sleep_until
@@ -98,15 +99,15 @@ class VirtualBus(AbstractContextManager["VirtualBus"]):
         config: What is emulated.
 
     Attributes:
-        now_s: The clock [s].
+        now_s: What it shows [s].
+        clock: Itself.
         emulator: Servos, joints and faults.
         driver: Driver of the servos, which are attached.
     """
 
-    is_confirmed_off = False
-
     def __init__(self, config: EmulatorConfig) -> None:
         self.now_s = 0.0
+        self.clock: Clock = self
         self._ahead_s = -np.inf
         self.emulator = Emulator(config, self, _Wire)
         self.driver: ServoBus = BUSES[servo_model(config.model_number).protocol](_NAME, config.rate)
@@ -120,11 +121,6 @@ class VirtualBus(AbstractContextManager["VirtualBus"]):
     def links(self) -> Array:
         """True angles of the links, (n,) [rad]."""
         return np.array(self.emulator.state["q"])
-
-    @property
-    def clock(self) -> "VirtualBus":
-        """Its clock."""
-        return self
 
     def monotonic(self) -> float:
         """Now [s]."""

@@ -5,7 +5,6 @@ target → follower → compensator → servo angles → bus → servos
 link estimate  └── motor encoders  ←──────┘
 """
 
-import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -413,28 +412,3 @@ def wrong_sign(
     turned = [misfit(joint)[0] for joint in range(len(theta))]
     best = int(np.argmin(turned))
     return best if turned[best] < _FLIPPED_SHARE * left else None
-
-
-def require_consent(question: str, port: str) -> None:
-    """Ask at the terminal whether the way is free.
-
-    Args:
-        question: What will happen.
-        port: For the messages.
-
-    Raises:
-        HardwareError: Nobody is there, or agrees.
-    """
-    if not sys.stdin.isatty():
-        problem = f"nobody is at the terminal to agree to a motion at {port}"
-        raise HardwareError(f"{problem}; if the way is free, say so by --yes")
-    if not answers_yes(f"{question} Type the whole word yes: "):
-        raise HardwareError(f"nobody agreed; nothing has moved at {port}")
-
-
-def answers_yes(question: str) -> bool:
-    """True if somebody at the terminal answers yes."""
-    try:
-        return input(question).strip().lower() == "yes"
-    except EOFError:
-        return False

@@ -13,6 +13,7 @@ import numpy as np
 from elastic_env.core.signals import Array, BoolArray
 from elastic_env.hardware.errors import HardwareError
 from elastic_env.hardware.imu import AttitudeStream
+from elastic_env.hardware.live.consent import require_consent
 from elastic_env.hardware.safety import realtime
 from elastic_env.hardware.safety.guard import exceeds
 from elastic_env.hardware.safety.supervised_bus import Cycle, SupervisedBus
@@ -109,7 +110,14 @@ class ServoPlant:
             HardwareError: Nobody agreed, or something of the hardware is not as it must be.
         """
         if not self._is_agreed:
-            require_agreement(self.settings, angle, self._pendulum_nm)
+            limits = self.settings.limits
+            question = (
+                f"The servo at {self.settings.port} will move to {angle:.3f} rad, then anywhere"
+                f" between its limits, {limits.lowest_rad:g} and {limits.highest_rad:g} rad, with"
+                f" a pendulum of {self._pendulum_nm:.1f} N·m. Is its way free, and the power switch"
+                " in reach?"
+            )
+            require_consent(question, self.settings.port)
             self._is_agreed = True
         with self._closing_on_error():
             bus = self._open_bus()
@@ -284,33 +292,3 @@ class ServoPlant:
                 f"{settings.largest_deflection_rad:g}: correct imu_sign, imu_axis and "
                 "imu_offset_rad of the mounting, or look what has come loose"
             )
-
-
-def require_agreement(settings: HardwareSettings, angle: float, load_nm: float) -> None:
-    """Ask at the terminal whether the way of a motion is free.
-
-    Args:
-        settings: Port and limits.
-        angle: Where the motion goes first [rad].
-        load_nm: Torque of the pendulum at the horizontal [N·m].
-
-    Raises:
-        HardwareError: Nobody is there, or agrees.
-    """
-    limits = settings.limits
-    question = (
-        f"The servo at {settings.port} will move to {angle:.3f} rad, then anywhere between its "
-        f"limits, {limits.lowest_rad:g} and {limits.highest_rad:g} rad, with a pendulum of "
-        f"{load_nm:.1f} N·m. Is its way free, and the power switch in reach? Type the whole "
-        "word yes: "
-    )
-    if not sys.stdin.isatty():
-        problem = f"nobody is at the terminal to agree to a motion at {settings.port}"
-        cure = "if the way is free, say so by --yes, in Python by confirm=False"
-        raise HardwareError(f"{problem}; {cure}")
-    try:
-        answer = input(question)
-    except EOFError:
-        answer = ""
-    if answer.strip().lower() != "yes":
-        raise HardwareError(f"nobody agreed; nothing has moved at {settings.port}")

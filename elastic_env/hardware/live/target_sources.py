@@ -7,6 +7,7 @@ import select
 import socket
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,8 @@ from elastic_env.core.signals import Array
 from elastic_env.motion.arm_references import Csv, Workspace
 
 _MOST_POSES = 10_000
-_MOST_PENDING = 1_000_000
+_MOST_READ = 4096
+"""Bytes of a stream that are read in a cycle."""
 _LONGEST_LINE = 100_000
 _REACHED_RAD = 1e-3
 _LAST_RAD = 1e-9
@@ -73,7 +75,7 @@ class Poses(Targets):
 
     @override
     def next(self, desired: Array, period_s: float) -> Array | None:
-        if self.is_reached(desired):
+        if _is_reached(desired, self.poses[self.number]):
             self._held_s += period_s
         if self._held_s > self._hold_s:
             self._held_s = 0.0
@@ -81,10 +83,6 @@ class Poses(Targets):
         if self.number >= len(self.poses):
             return None
         return self.poses[self.number]
-
-    def is_reached(self, desired: Array) -> bool:
-        """True if the desired angles are those of the pose."""
-        return bool(np.abs(desired - self.poses[self.number]).max() < _REACHED_RAD)
 
 
 class Trajectory(Targets):
@@ -102,10 +100,15 @@ class Trajectory(Targets):
     @override
     def next(self, desired: Array, period_s: float) -> Array | None:
         if not self._has_begun:
-            self._has_begun = bool(np.abs(desired - self._q[0]).max() < _REACHED_RAD)
+            self._has_begun = _is_reached(desired, self._q[0])
             return self._q[0]
         self.number += 1
         return self._q[self.number] if self.number < len(self._q) else None
+
+
+def _is_reached(desired: Array, pose: Array) -> bool:
+    """True if the desired angles are those of a pose."""
+    return bool(np.abs(desired - pose).max() < _REACHED_RAD)
 
 
 class Stream(Targets):
@@ -115,13 +118,13 @@ class Stream(Targets):
     joint [rad]. Other lines are counted and change nothing.
 
     Args:
-        descriptor: Of a file, pipe or socket.
+        descriptor: Of a file, pipe or socket; None where nobody is there yet.
         joints: Names of the joints, (n,).
         lowest, highest: Their ranges, (n,) [rad].
     """
 
     def __init__(
-        self, descriptor: int, joints: Sequence[str], lowest: Array, highest: Array
+        self, descriptor: int | None, joints: Sequence[str], lowest: Array, highest: Array
     ) -> None:
         super().__init__()
         self._descriptor = descriptor
@@ -137,17 +140,15 @@ class Stream(Targets):
     def next(self, desired: Array, period_s: float) -> Array | None:
         if self._target is None:
             self._target = desired.copy()
-        while not self._is_over and select.select([self._descriptor], [], [], 0.0)[0]:
-            try:
-                data = os.read(self._descriptor, 65536)
-            except OSError:  # the client is gone
-                data = b""
+        data = b""
+        source = self._descriptor
+        if source is not None and not self._is_over and select.select([source], [], [], 0.0)[0]:
+            # what is left comes in the next cycle: a sender that is faster must not hold this one
+            with suppress(OSError):  # the client is gone
+                data = os.read(source, _MOST_READ)
             self._is_over = not data
-            self._pending += data
-            if len(self._pending) > _MOST_PENDING:
-                self._pending = b""
-                self._refuse("a line without an end")
-        *lines, self._pending = self._pending.split(b"\n")
+        *lines, rest = (self._pending + data).split(b"\n")
+        self._pending = rest[: _LONGEST_LINE + 1]
         for line in lines:
             if line.strip():
                 self._take(line)
@@ -159,14 +160,11 @@ class Stream(Targets):
             target = parse_target(line.decode(), self._joints, self._target)
             require_in_range("the line", self._joints, target, self._lowest, self._highest)
         except (TypeError, ValueError, ConfigurationError) as error:
-            self._refuse(str(error))
+            self.refused += 1
+            self.problem = str(error)
             return
         self._target = target
         self.number += 1
-
-    def _refuse(self, problem: str) -> None:
-        self.refused += 1
-        self.problem = problem
 
 
 class Socket(Stream):
@@ -182,7 +180,7 @@ class Socket(Stream):
     """
 
     def __init__(self, port: int, joints: Sequence[str], lowest: Array, highest: Array) -> None:
-        super().__init__(-1, joints, lowest, highest)
+        super().__init__(None, joints, lowest, highest)
         self._server = socket.create_server(("127.0.0.1", port))
         self._server.setblocking(False)
         self._client: socket.socket | None = None
@@ -191,11 +189,7 @@ class Socket(Stream):
 
     @override
     def next(self, desired: Array, period_s: float) -> Array | None:
-        if self._client is None:
-            if self._target is None:
-                self._target = desired.copy()
-            if not select.select([self._server], [], [], 0.0)[0]:
-                return self._target
+        if self._client is None and select.select([self._server], [], [], 0.0)[0]:
             self._client, _ = self._server.accept()
             self._client.setblocking(False)
             self._descriptor = self._client.fileno()
@@ -233,11 +227,15 @@ def parse_target(line: str, joints: Sequence[str], before: Array) -> Array:
         ConfigurationError: A joint does not exist.
     """
     n = len(joints)
+    if len(line) > _LONGEST_LINE:
+        raise ValueError(f"a line must have at most {_LONGEST_LINE} characters")
     if line.lstrip().startswith("{"):
-        angles = parse_json(line, most=_LONGEST_LINE)
+        angles = parse_json(line)
         require_known("joint", angles, joints)
         target = before.copy()
         for name, angle in angles.items():
+            if isinstance(angle, bool | str):
+                raise ValueError(f"angles must be numbers [rad], got {quote(angle)} for {name!r}")
             target[list(joints).index(name)] = float(angle)
     else:
         target = np.array([float(cell) for cell in line.split(",")])

@@ -145,7 +145,7 @@ class Supervisor:
         self._disable()
         safety_limits = SafetyLimits(**limits)
         servos = self._servos.servos
-        names = self._servos.names
+        names = [servo_name(bus, servo_id) for bus, servo_id in servos]
         conditions = [bus.read_condition(servo_id) for bus, servo_id in servos]
         for name, condition in zip(names, conditions, strict=True):
             require_ready(name, condition, safety_limits.temperature_c)
