@@ -854,6 +854,26 @@ def test_wrong_option_says_what_and_which_choices(
     assert not Path("runs").exists()
 
 
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--measured-by", "imu", "--geometry", "dh"], "needs positions"),
+        (["--measured-by", "end_effector", "--lateral"], "--lateral: for a fit of the geometry"),
+        (["--measured-by", "end_effector", "--free", "elbow"], "--free: for a fit of the geometry"),
+    ],
+)
+def test_a_geometry_needs_positions_and_is_asked_for(
+    options: list[str], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Catches a traceback, and options of the geometry that are dropped without a word."""
+    with Path("log.csv").open("w", newline="") as file:
+        csv.writer(file).writerows(both_kinds())
+    with pytest.raises(SystemExit) as ended:
+        run("--log", "log.csv", *options)
+    assert ended.value.code == 2
+    assert said in " ".join(capsys.readouterr().err.split())
+
+
 def test_a_log_that_no_springs_explain_is_refused() -> None:
     """Catches an endless fit, and a stiffness from measurements of another arm."""
     log = log_of("link_encoders", 15)

@@ -29,6 +29,7 @@ from baselines.identification.holdout import (
 from baselines.identification.pose_log import read_log, write_poses
 from elastic_env.core.errors import ConfigurationError, ElasticError
 from elastic_env.core.signals import Array
+from elastic_env.core.yaml_text import parse_yaml
 from elastic_env.rigid.tree.links import Tree
 from tests import test_arm_identification
 from train.commands.cli import main
@@ -371,6 +372,8 @@ def test_the_command_identifies_and_its_files_hold(
     out = tmp_path / "out"
     asked = ["identify", "--robot", str(model), "--log", str(log), "--geometry", "dh"]
     main([*asked, "--output", str(out)])
+    config = parse_yaml((out / "config.yaml").read_text())
+    assert (config["robot"], config["log"]) == (str(model), [str(log)])
     said = capsys.readouterr().out
     assert "held out" in said
     assert "keep their prior" in said
@@ -439,7 +442,15 @@ def test_folds_hold_out_each_pose_once(geometry: GeometryModel) -> None:
 
 
 @pytest.mark.parametrize(
-    "option", ["--plan 20", "--payload hand", "--assume 900", "--end-effector hand"]
+    "option",
+    [
+        "--plan 20",
+        "--payload hand",
+        "--assume 900",
+        "--end-effector hand",
+        "--frame known",
+        "--within 0.1",
+    ],
 )
 def test_an_option_without_use_is_refused(
     geometry: GeometryModel, tmp_path: Path, capsys: pytest.CaptureFixture[str], option: str

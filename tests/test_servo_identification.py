@@ -32,6 +32,7 @@ from docs.pages.recorded import priors
 from docs.recorded.servos import FURTHER_SEEDS, servo_figures, servo_rows
 from elastic_env.core.errors import ConfigurationError, ElasticError, MissingExtraError
 from elastic_env.core.signals import Array
+from elastic_env.core.yaml_text import parse_yaml
 from elastic_env.joint.joint_settings import read_joints
 from tests.servo_trials import SOUGHT, draw_servo, holds, make_logs
 from train.commands.cli import main
@@ -592,6 +593,7 @@ def test_command_reads_a_log_and_writes_what_others_read(
     assert joint.servo.position_gain == pytest.approx(gains, rel=1e-3)
     assert joint.load_friction == pytest.approx(result.value("load_friction"), rel=1e-3)
     assert Path("out/identification.png").stat().st_size > 1000
+    assert parse_yaml(Path("out/config.yaml").read_text())["judged"]["holdout"] == 0.3
 
 
 def quick_fit(logs: Sequence[ServoLog], *rest: object) -> ServoFit:

@@ -24,7 +24,6 @@ from train.figures import plots
 from train.figures.identification_plots import draw_identification
 from train.runs.console import make_table
 from train.runs.escaping import write_records
-from train.runs.folders import run_folder
 from train.runs.progress import plain_progress, show_progress
 
 
@@ -85,9 +84,8 @@ class Identify(IdentificationRun):
         if hardware:
             self._require_real_joint(hardware)
         envs = identified_environments(self)
-        recorded = {**self.testbed.model_dump(mode="json"), "seed": self.seed}
-        recorded |= {"scenario": scenario, "hardware": hardware}
-        with run_folder("identify", recorded, self.seed, self.output) as folder:
+        asked = {**self.testbed.model_dump(mode="json"), "scenario": scenario}
+        with self.folder({**asked, "hardware": hardware}) as folder:
             try:
                 with _progress(hardware, console) as progress:
                     results, points = identify(envs, self.seed, progress)

@@ -51,7 +51,6 @@ from train.commands.options import given_options
 from train.figures import plots
 from train.figures.identification_plots import draw_arm_identification
 from train.runs.console import make_table
-from train.runs.folders import run_folder
 from train.runs.progress import show_progress
 
 _ASSUMED_DEFLECTION_RAD = 0.01
@@ -103,11 +102,14 @@ def identify_arm(
     plots.require_matplotlib()
     setting = _setting(options, compiled_model(str(options.robot)), console, run.seed)
     if setting.seeks_geometry:
-        _require_no_plan(options, setting.log)
+        _require_positions(options, setting.log)
         tool = setting.arm.end_effector
         return identify_geometry(options, setting.log, setting.elastic, tool, run, console)
-    recorded = {**options.model_dump(mode="json"), "seed": run.seed}
-    with run_folder("identify", recorded, run.seed, run.output) as folder:
+    if of_geometry := given_options(options.markers, ["lateral", "free"]):
+        raise ConfigurationError(
+            f"{', '.join(of_geometry)}: for a fit of the geometry only; ask for one by --geometry"
+        )
+    with run.folder(options.model_dump(mode="json")) as folder:
         if not options.log:
             _plan_first(setting, folder, console)
             return None
@@ -275,17 +277,24 @@ def shaped_model(path: str) -> mujoco.MjModel:
     return shaped if set(hinges_of(plain)) <= set(hinges_of(shaped)) else plain
 
 
-def _require_no_plan(options: ArmOptions, log: PoseLog) -> None:
-    """Refuse options that a fit of the geometry has no use for.
+def _require_positions(options: ArmOptions, log: PoseLog) -> None:
+    """Refuse measurements and options that a fit of the geometry has no use for.
 
     Raises:
-        ConfigurationError: One of them is given.
+        ConfigurationError: The log has no positions, or one of the options is given.
     """
     of_site = ["end_effector"] if log.kind == "markers" else []
-    if unused := given_options(options, ["plan", "payload", "assume", *of_site]):
+    of_poses = ["plan", "payload", "assume", "frame", "within", *of_site]
+    if unused := given_options(options, of_poses):
         raise ConfigurationError(
             f"{', '.join(unused)} {'is' if len(unused) == 1 else 'are'} not for a fit of the"
             " geometry from markers; leave it out"
+        )
+    if log.kind not in ("markers", "end_effector"):
+        raise ConfigurationError(
+            "a fit of the geometry needs positions, in columns marker.NAME.x, .y, .z or"
+            f" end_effector.x, .y, .z, and {options.log[0]} is used for its"
+            f" {log.kind.replace('_', ' ')}; leave --geometry out"
         )
 
 

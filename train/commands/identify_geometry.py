@@ -24,7 +24,6 @@ from train.commands.held_out import judge_poses, number_or_dash, show_held_out
 from train.commands.identify_options import ArmOptions, GeometryOptions, IdentificationRun
 from train.figures.identification_plots import draw_geometry
 from train.runs.console import make_table
-from train.runs.folders import run_folder
 from train.runs.progress import show_progress
 
 
@@ -52,9 +51,7 @@ def identify_geometry(
     """
     spec = read_model(str(options.robot)).spec
     problem, tree = pose_problem(options.markers, spec.compile(), log, elastic, end_effector)
-    recorded = options.markers.model_dump(mode="json") | options.judged.model_dump()
-    recorded["seed"] = run.seed
-    with run_folder("identify", recorded, run.seed, run.output) as folder:
+    with run.folder(options.model_dump(mode="json")) as folder:
         with show_progress(console, {"fits": 1}, transient=True) as show:
             fit = fit_geometry(problem)
             show(0, 1)

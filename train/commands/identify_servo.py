@@ -28,7 +28,6 @@ from train.commands.options import given_options
 from train.figures import plots
 from train.figures.identification_plots import draw_servo
 from train.runs.console import make_table
-from train.runs.folders import run_folder
 from train.runs.progress import show_progress
 
 
@@ -69,8 +68,7 @@ def identify_servo(
     outer = further
     if not further and options.judged.holdout:
         inner, outer = split_logs(logs, options.judged.holdout, run.seed)
-    recorded = {**servo.model_dump(mode="json"), "log": paths, "seed": run.seed}
-    with run_folder("identify", recorded, run.seed, run.output) as folder:
+    with run.folder(options.model_dump(mode="json")) as folder:
         fits = 1 if inner is logs else 2
         with show_progress(console, {"fits, stages": fits * STAGES}, transient=True) as show:
             fit = fit_servo(inner, partial(show, 0), run.seed)
