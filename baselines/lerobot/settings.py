@@ -1,9 +1,7 @@
 """Settings of an arm of LeRobot: which motor moves which joint, its calibration, the model."""
 
-import csv
 import math
 from functools import cache
-from importlib import resources
 from pathlib import Path
 from typing import Any, Literal, Self
 
@@ -12,6 +10,7 @@ from pydantic import model_validator
 from elastic_env.core.config import Model, Title, quantity, read_json
 from elastic_env.core.config_problems import ModelError
 from elastic_env.core.errors import ConfigurationError, require_known, shorten
+from elastic_env.core.files import read_rows
 
 Units = Literal["degrees", "range", "percent"]
 """Degrees, −100 to 100 over the calibrated range, or 0 to 100 over it."""
@@ -129,11 +128,8 @@ class ArmSettings(Model):
 @cache
 def _known_motors() -> dict[str, tuple[Motor, ...]]:
     """Motors of the robots of motors.csv, by the robot's type."""
-    file = resources.files("baselines.lerobot") / "motors.csv"
-    lines = file.read_text(encoding="utf-8").splitlines()
-    rows = csv.DictReader(line for line in lines if not line.startswith("#"))
     found: dict[str, tuple[Motor, ...]] = {}
-    for row in rows:
+    for row in read_rows(Path(__file__).with_name("motors.csv")):
         counts = row["counts_per_turn"]
         motor = Motor(
             name=row["motor"],
