@@ -126,7 +126,7 @@ class ArmSettings(Model):
 
 
 @cache
-def _known_motors() -> dict[str, tuple[Motor, ...]]:
+def known_motors() -> dict[str, tuple[Motor, ...]]:
     """Motors of the robots of motors.csv, by the robot's type."""
     found: dict[str, tuple[Motor, ...]] = {}
     for row in read_rows(Path(__file__).with_name("motors.csv")):
@@ -141,11 +141,6 @@ def _known_motors() -> dict[str, tuple[Motor, ...]]:
     return found
 
 
-def robot_types() -> list[str]:
-    """Types of robots that are known, as LeRobot names them."""
-    return list(_known_motors())
-
-
 def motors_of(robot: str, use_degrees: bool | None = None) -> tuple[Motor, ...]:
     """Motors of a robot in LeRobot's order.
 
@@ -156,7 +151,7 @@ def motors_of(robot: str, use_degrees: bool | None = None) -> tuple[Motor, ...]:
     Raises:
         ConfigurationError: The type is not known, or its motors know degrees alone.
     """
-    known = _known_motors()
+    known = known_motors()
     require_known("robot of LeRobot", [robot], known)
     motors = known[robot]
     if use_degrees is None:
