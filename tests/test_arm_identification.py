@@ -828,6 +828,19 @@ def test_bad_log_is_one_sentence_that_says_what_to_do(
     assert not Path("runs").exists()
 
 
+def test_degrees_are_named_where_a_joint_has_no_range(capsys: pytest.CaptureFixture[str]) -> None:
+    """Exporters write a hundred turns and more for a joint without a limit: catches degrees that
+    are taken for radians."""
+    elbow = '"elbow" axis="0 1 0" range="-2.4 2.4"'
+    free = (FOLDER / "arm.xml").read_text().replace(elbow, elbow.replace("2.4", "1e9"))
+    Path("free.xml").write_text(free)
+    with Path("bad.csv").open("w", newline="") as file:
+        csv.writer(file).writerows(changed("theta.elbow", lambda v: str(math.degrees(float(v)))))
+    with pytest.raises(SystemExit):
+        main(["identify", "--robot", "free.xml", "--log", "bad.csv", "--end-effector", "marker"])
+    assert "look like degrees" in " ".join(capsys.readouterr().err.split())
+
+
 REFUSED: Mapping[str, tuple[list[str], list[str]]] = {
     "missing log": (["--log", "none.csv"], ["no log at none.csv"]),
     "neither": ([], ["--log", "--plan", "--measured-by"]),

@@ -43,6 +43,7 @@ from baselines.identification.static_arm import StaticArm
 from elastic_env.core.errors import ConfigurationError, quote, unknown_name
 from elastic_env.joint.model_file import compiled_model, from_mujoco
 from elastic_env.joint.supported_models import commanded_hinges, hinges_of
+from elastic_env.world.robot_model import joint_ranges
 from train.commands.held_out import judge_poses, number_or_dash, show_held_out
 from train.commands.identify_geometry import identify_geometry
 from train.commands.identify_options import ArmOptions, IdentificationRun, ServoOptions
@@ -301,9 +302,9 @@ def _require_positions(options: ArmOptions, log: PoseLog) -> None:
 def _setting(options: ArmOptions, model: mujoco.MjModel, console: Console, seed: int) -> _Setting:
     """Read the log, and look everything up that is named."""
     hinges = hinges_of(model)
-    ranges = {name: _range(model, name) for name in hinges}
     log = None
     if options.log:
+        ranges = dict(zip(hinges, zip(*joint_ranges(model, hinges), strict=True), strict=True))
         log = read_log(Path(options.log[0]), ranges, options.measured_by)
     joints = commanded_hinges(model) if log is None else log.joints
     arm = StaticArm(model, joints, options.end_effector, options.payload)
@@ -320,12 +321,6 @@ def _setting(options: ArmOptions, model: mujoco.MjModel, console: Console, seed:
     if options.log and not setting.seeks_geometry:
         require_poses(setting.model(log))
     return setting
-
-
-def _range(model: mujoco.MjModel, joint: str) -> tuple[float, float]:
-    hinge = model.joint(joint)
-    low, high = hinge.range if model.jnt_limited[hinge.id] else (-np.inf, np.inf)
-    return float(low), float(high)
 
 
 def _elastic_joints(patterns: Sequence[str], joints: Sequence[str]) -> tuple[str, ...]:
