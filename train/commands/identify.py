@@ -11,13 +11,10 @@ from rich.console import Console
 from rich.table import Table
 
 import elastic_env  # noqa: F401  registers the environments
-from baselines.identification.arm_result import ArmIdentification
-from baselines.identification.geometry_result import GeometryIdentification
 from baselines.identification.identify import Identification, identify
-from baselines.identification.servo_result import ServoIdentification
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.robots.testbed.model import Pendulum
-from train.commands.identify_arm import identify_arm
+from train.commands.identify_arm import IdentifiedArm, identify_arm
 from train.commands.identify_options import ArmOptions, IdentificationRun, OfTestbed
 from train.commands.options import OnHardware, given_options
 from train.figures import plots
@@ -49,15 +46,7 @@ class Identify(IdentificationRun):
     on: Annotated[OnHardware, tyro.conf.arg(name="hardware")] = OnHardware()
     arm: ArmOptions = ArmOptions()
 
-    def run(
-        self, console: Console
-    ) -> (
-        list[Identification]
-        | ArmIdentification
-        | GeometryIdentification
-        | ServoIdentification
-        | None
-    ):
+    def run(self, console: Console) -> list[Identification] | IdentifiedArm | None:
         """Identify the testbed, simulated or real, or an arm; write result and figure.
 
         Returns:

@@ -38,6 +38,7 @@ from baselines.identification.pose_plan import (
     plan_further,
     plan_poses,
 )
+from baselines.identification.servo_file import is_servo_log
 from baselines.identification.servo_result import ServoIdentification
 from baselines.identification.static_arm import StaticArm
 from elastic_env.core.errors import ConfigurationError, quote, unknown_name
@@ -47,13 +48,14 @@ from elastic_env.world.robot_model import joint_ranges
 from train.commands.held_out import judge_poses, number_or_dash, show_held_out
 from train.commands.identify_geometry import identify_geometry
 from train.commands.identify_options import ArmOptions, IdentificationRun, ServoOptions
-from train.commands.identify_servo import are_servo_logs, identify_servo
+from train.commands.identify_servo import identify_servo
 from train.commands.options import given_options
 from train.figures import plots
 from train.figures.identification_plots import draw_arm_identification
 from train.runs.console import make_table
 from train.runs.progress import show_progress
 
+IdentifiedArm = ArmIdentification | GeometryIdentification | ServoIdentification
 _ASSUMED_DEFLECTION_RAD = 0.01
 """Deflection under the largest gravity torque that a plan without a log assumes."""
 
@@ -82,7 +84,7 @@ class _Setting:
 
 def identify_arm(
     options: ArmOptions, run: IdentificationRun, console: Console
-) -> ArmIdentification | GeometryIdentification | ServoIdentification | None:
+) -> IdentifiedArm | None:
     """Identify an arm or a servo, write files and print the result; or plan poses.
 
     Args:
@@ -97,7 +99,7 @@ def identify_arm(
         ConfigurationError: Model, log or a name cannot be used.
         ResultsExistError: The output folder holds results.
     """
-    if are_servo_logs(options.log):
+    if options.log and is_servo_log(Path(options.log[0])):
         return identify_servo(options, run, console)
     _require_poses(options)
     plots.require_matplotlib()

@@ -61,7 +61,7 @@ def identify_geometry(
         files.append(draw_geometry(result, folder / f"identification.{run.figure_format}"))
     show_result(result, console)
     for path in files:
-        console.print(f"wrote {path}", soft_wrap=True)
+        console.print(f"wrote {path}")
     return result
 
 
@@ -141,6 +141,5 @@ def show_result(result: GeometryIdentification, console: Console) -> None:
     if unseen:
         console.print(
             f"{len(unseen)} of {len(result.parameters)} parameters keep their prior, as the"
-            f" poses do not tell them: {list_names(unseen)}",
-            highlight=False,
+            f" poses do not tell them: {list_names(unseen)}"
         )

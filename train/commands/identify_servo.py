@@ -9,7 +9,6 @@ from pathlib import Path
 from rich import box
 from rich.console import Console
 
-from baselines.identification.servo_file import is_servo_log
 from baselines.identification.servo_fit import STAGES, fit_servo
 from baselines.identification.servo_holdout import ServoHoldout, judge_servo, split_logs
 from baselines.identification.servo_load import Load
@@ -29,11 +28,6 @@ from train.figures import plots
 from train.figures.identification_plots import draw_servo
 from train.runs.console import make_table
 from train.runs.progress import show_progress
-
-
-def are_servo_logs(paths: Sequence[str]) -> bool:
-    """True if the first of some files is a log in time."""
-    return bool(paths) and is_servo_log(Path(paths[0]))
 
 
 def identify_servo(
@@ -83,7 +77,7 @@ def identify_servo(
         files.append(draw_servo(shown, played, picture, is_held_out=bool(outer)))
     show_result(result, console)
     for path in files:
-        console.print(f"wrote {path}", soft_wrap=True)
+        console.print(f"wrote {path}")
     return result
 
 
@@ -129,7 +123,7 @@ def known_load(options: ServoOptions, robot: str | None, joint: str | None) -> L
 def show_result(result: ServoIdentification, console: Console) -> None:
     """Print held-out errors, parameters, and what the logs do not tell."""
     if result.held_out is not None:
-        console.print(verdict(result.held_out), highlight=False)
+        console.print(verdict(result.held_out))
         rows = [
             [error.name, f"{error.rms_mrad:.1f}", number_or_dash(error.slow_mrad, ".1f")]
             for error in result.held_out.errors
@@ -161,7 +155,7 @@ def show_result(result: ServoIdentification, console: Console) -> None:
     console.print(make_table(title, head, rows, box=box.SIMPLE))
     console.print("the logs do not tell:")
     for line in result.untold:
-        console.print(f"  {line}", highlight=False)
+        console.print(f"  {line}")
 
 
 def verdict(held_out: ServoHoldout) -> str:
@@ -204,7 +198,7 @@ def fitted_logs(paths: Sequence[str], unfitted: Sequence[str], console: Console)
             f"--unfitted names all logs of --log, {', '.join(left_out)}: leave one to fit"
         )
     if left_out:
-        console.print(f"not fitted, as --unfitted says: {', '.join(left_out)}", highlight=False)
+        console.print(f"not fitted, as --unfitted says: {', '.join(left_out)}")
     return [path for path in paths if path not in left_out]
 
 
