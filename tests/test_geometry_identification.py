@@ -10,7 +10,6 @@ import pytest
 from baselines.identification.geometry_fit import (
     QUANTILE,
     GeometryProblem,
-    align_tracker,
     fit_geometry,
 )
 from baselines.identification.geometry_model import AxialTorques, GeometryModel, Parameters
@@ -218,9 +217,10 @@ def made_up(
     problem = GeometryProblem(arm, theta, blank, JOINTS, elastic=JOINTS, **options)  # type: ignore[arg-type]
     prior = problem.unknowns.prior
     truth = prior * generator.standard_normal(len(prior))
-    for kind in ("translation", "rotation", "marker"):
-        truth[problem.unknowns.part(kind)] *= 0.1  # what an alignment leaves
-    own = problem.unknowns.part("compliance")
+    kinds = np.array(problem.unknowns.kinds)
+    # what an alignment leaves
+    truth[np.isin(kinds, ["translation", "rotation", "marker"])] *= 0.1
+    own = np.flatnonzero(kinds == "compliance")
     truth[own] = prior[own] * generator.uniform(0.1, 0.6, len(own))
     shown = arm.predict_markers(problem.parameters(truth), theta, problem.axial)
     measured = shown + noise_m * generator.standard_normal(blank.shape)
@@ -425,7 +425,7 @@ def test_the_tracker_is_aligned_before_the_fit(geometry: GeometryModel) -> None:
         rotation=np.array([0.0, 0.0, 3.0]), translation=np.array([1.0, -2.0, 0.5])
     )
     measured = geometry.predict_markers(turned, theta)
-    own = align_tracker(geometry, theta, measured)
+    own = GeometryProblem(geometry, theta, measured, JOINTS).align().model
     shown = own.predict_markers(own.nominal_parameters(), theta)
     np.testing.assert_allclose(shown, measured, atol=1e-9)
 
@@ -469,7 +469,7 @@ def test_millimetres_are_named(geometry: GeometryModel) -> None:
     """Catches a fit that takes them for metres, and gives up after minutes."""
     problem, _ = made_up(geometry, 7, count=20, noise_m=3e-4)
     with pytest.raises(ConfigurationError, match="convert millimetres to metres"):
-        align_tracker(geometry, problem.theta, 1e3 * problem.measured)
+        replace(problem, measured=1e3 * problem.measured).align()
 
 
 def test_a_joint_that_gravity_does_not_load_is_rigid(geometry: GeometryModel) -> None:

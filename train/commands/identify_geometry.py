@@ -7,7 +7,7 @@ import numpy as np
 from rich import box
 from rich.console import Console
 
-from baselines.identification.geometry_fit import GeometryProblem, align_tracker, fit_geometry
+from baselines.identification.geometry_fit import GeometryProblem, fit_geometry
 from baselines.identification.geometry_model import AxialTorques, GeometryModel
 from baselines.identification.geometry_result import (
     GeometryIdentification,
@@ -85,11 +85,8 @@ def pose_problem(
         names = [column.removesuffix(".x") for column in log.columns[::3]]
     markers = [(name, *place_of(model, name)) for name in names]
     measured = log.measured.reshape(len(log), len(names), 3)
-    geometry = align_tracker(
-        GeometryModel.of(tree, log.joints, model.opt.gravity, markers), log.theta, measured
-    )
     problem = GeometryProblem(
-        model=geometry,
+        model=GeometryModel.of(tree, log.joints, model.opt.gravity, markers),
         theta=log.theta,
         measured=measured,
         joints=log.joints,
@@ -100,7 +97,7 @@ def pose_problem(
         free=options.free,
         axial=_axial(log),
     )
-    return problem, tree
+    return problem.align(), tree
 
 
 def _axial(log: PoseLog) -> AxialTorques | None:
