@@ -10,11 +10,7 @@ from elastic_env.core.config import Model
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
 
-GOAL = "the goal itself"
-OFFSET = "a constant offset"
-LINE = "a line in the goal"
-REPLAYED = "identified"
-PREDICTIONS = (GOAL, OFFSET, LINE, REPLAYED)
+PREDICTIONS = ("the goal itself", "a constant offset", "a line in the goal", "identified")
 _FEWEST_HELD_OUT = 20
 
 

@@ -224,11 +224,15 @@ def _gain(
     """Value of the gain register by option and file.
 
     Raises:
-        ConfigurationError: They contradict each other, or it is not positive.
+        ConfigurationError: They contradict each other, or it changes, or is not positive.
     """
     own = facts.get("kp")
     if "gain" in columns:
-        own = _constant_gain(path, columns["gain"])
+        own = float(columns["gain"][0])
+        if np.ptp(columns["gain"]) > 0.0:
+            raise ConfigurationError(
+                f"{path}: the gain changes within the log; give each gain a file of its own"
+            )
     if own is not None and gain is not None and not math.isclose(own, gain, rel_tol=_SAME):
         raise ConfigurationError(
             f"{path} says that the gain is {own:g}, and --gain {gain:g}; leave --gain out, or"
@@ -313,14 +317,6 @@ def _require_plausible_goal(path: Path, log: ServoLog) -> None:
             f"{path}: the joint goes beyond its goal against the load; are goal and position"
             " exchanged, or is a sign or the zero (hanging down) wrong?"
         )
-
-
-def _constant_gain(path: Path, column: Array) -> float:
-    if np.ptp(column) > 0.0:
-        raise ConfigurationError(
-            f"{path}: the gain changes within the log; give each gain a file of its own"
-        )
-    return float(column[0])
 
 
 def _signed(register: Array) -> Array:

@@ -168,18 +168,16 @@ class ServoProblem:
         """Effects that are sought where they show, each with a start beside parameters z."""
         further = []
         if self.duty is None and any(log.enabled.any() for log in self.logs):
-            further.append({"torque_limit": _SATURATED * self._largest_pull(z)})
+            gain = self.expand(z)[AT["position_gain"]]
+            pulls = [
+                gain * log.gain * log.supply * np.abs(log.goal - log.position)[log.enabled]
+                for log in self.logs
+            ]
+            # what the servo would give without a limit
+            largest = float(np.concatenate(pulls).max()) / self.scale[AT["torque_limit"]]
+            further.append({"torque_limit": _SATURATED * largest})
         further.append({"static_friction": 0.5, "stribeck_speed": 1.0})
         return further
-
-    def _largest_pull(self, z: Array) -> float:
-        """Largest torque that the servo would give without a limit, in the unit of the limit."""
-        gain = self.expand(z)[AT["position_gain"]]
-        pulls = [
-            gain * log.gain * log.supply * np.abs(log.goal - log.position)[log.enabled]
-            for log in self.logs
-        ]
-        return float(np.concatenate(pulls).max()) / self.scale[AT["torque_limit"]]
 
     def expand(self, z: Array) -> Array:
         """Parameters of the replay."""
