@@ -25,7 +25,7 @@ from baselines.identification.holdout import (
     predict_linear,
     split,
 )
-from baselines.identification.pose_log import read_log, write_poses
+from baselines.identification.pose_log import PoseLog, read_log, write_poses
 from elastic_env.core.errors import ConfigurationError, ElasticError
 from elastic_env.core.signals import Array
 from elastic_env.core.yaml_text import parse_yaml
@@ -428,6 +428,24 @@ def test_the_tracker_is_aligned_before_the_fit(geometry: GeometryModel) -> None:
     own = GeometryProblem(geometry, theta, measured, JOINTS).align().model
     shown = own.predict_markers(own.nominal_parameters(), theta)
     np.testing.assert_allclose(shown, measured, atol=1e-9)
+
+
+def test_joints_that_are_not_in_the_log_stand_where_the_keyframe_has_them() -> None:
+    """Catches markers behind a joint that is held elsewhere than the compensator holds it."""
+    key = '<keyframe><key qpos="0 0 0 0.8"/></keyframe></mujoco>'
+    model = mujoco.MjModel.from_xml_string(ARM.replace("</mujoco>", key))
+    data = mujoco.MjData(model)
+    theta = draw(4, 12)[1]
+    measured = []
+    for row in theta:
+        data.qpos[:] = [*row[:3], 0.8]
+        mujoco.mj_forward(model, data)
+        measured.append(np.ravel([data.site(name).xpos for name in SITES]))
+    columns = tuple(f"{name}.{axis}" for name in SITES for axis in "xyz")
+    log = PoseLog(JOINTS[:3], theta[:, :3], "markers", columns, np.array(measured))
+    problem, _ = pose_problem(GeometryOptions(), model, log, (), "hand")
+    nothing = np.zeros(len(problem.unknowns.prior))
+    np.testing.assert_allclose(problem.residual(nothing), 0.0, atol=1e-9)
 
 
 def test_folds_hold_out_each_pose_once(geometry: GeometryModel) -> None:

@@ -16,7 +16,7 @@ from baselines.identification.geometry_result import (
 )
 from baselines.identification.holdout import Judged
 from baselines.identification.pose_log import PoseLog
-from baselines.identification.static_arm import place_of
+from baselines.identification.static_arm import held_positions, place_of
 from elastic_env.core.errors import list_names, unknown_name
 from elastic_env.joint.model_file import read_model
 from elastic_env.rigid.tree.links import Tree
@@ -76,10 +76,7 @@ def pose_problem(
     for joint in options.free:
         if joint not in log.joints:
             raise unknown_name("joint of the log", joint, log.joints)
-    joints = [model.joint(number) for number in range(model.njnt)]
-    others = [joint for joint in joints if joint.name not in log.joints]
-    held = {joint.name: float(joint.qpos0[0]) for joint in others}
-    tree = Tree.of(model, log.joints, held)
+    tree = Tree.of(model, log.joints, held_positions(model, log.joints))
     names = [end_effector]
     if log.kind == "markers":
         names = [column.removesuffix(".x") for column in log.columns[::3]]
