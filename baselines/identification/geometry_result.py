@@ -126,19 +126,14 @@ def correct_model(spec: mujoco.MjSpec, tree: Tree, fit: GeometryFit) -> mujoco.M
 
 def _joint(joint: str, estimate: GeometryEstimate | None) -> JointCompliance:
     """Stiffness by a compliance; rigid where it is not sought, not told, or not above zero."""
-    if estimate is None or estimate.value <= 0.0 or not estimate.is_told:
-        return JointCompliance(
-            joint=joint,
-            stiffness_nm_per_rad=math.inf,
-            stiffness_low_nm_per_rad=None,
-            stiffness_high_nm_per_rad=None,
-        )
-    c = estimate.value
-    h = estimate.half_width
+    c = h = 0.0
+    if estimate is not None and estimate.value > 0.0 and estimate.is_told:
+        c = estimate.value
+        h = estimate.half_width
     return JointCompliance(
         joint=joint,
-        stiffness_nm_per_rad=1.0 / c,
-        stiffness_low_nm_per_rad=1.0 / (c + h),
+        stiffness_nm_per_rad=1.0 / c if c else math.inf,
+        stiffness_low_nm_per_rad=1.0 / (c + h) if c else None,
         stiffness_high_nm_per_rad=1.0 / (c - h) if c > h else None,
     )
 

@@ -30,9 +30,9 @@ class ServoParameter(Model):
 
     name: str
     unit: str
-    value: float | None
+    value: float | None = None
     """None where it was not sought."""
-    half_width: float | None
+    half_width: float | None = None
     """Half of the interval; None where it follows from an assumption, or was not sought."""
     is_told: bool
     """True if the logs tell it, to half its value or better."""
@@ -169,9 +169,7 @@ def _parameter(fit: ServoFit, name: str, supply: float) -> ServoParameter:
     half = fit.half(name) * scale
     is_known = name in fit.tied or bool(fit.sought[list(PARAMETERS).index(name)])
     if not is_known or not np.isfinite(value):
-        return ServoParameter(
-            name=name, unit=PARAMETERS[name], value=None, half_width=None, is_told=False
-        )
+        return ServoParameter(name=name, unit=PARAMETERS[name], is_told=False)
     has_interval = bool(np.isfinite(half))
     within = _TOLD_WITHIN.get(name, 0.0)
     if name in ("coulomb_friction", "static_friction"):

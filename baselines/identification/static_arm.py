@@ -46,7 +46,7 @@ class StaticArm:
             payload.
 
     Raises:
-        ConfigurationError: The model cannot be used, or a name does not exist.
+        ConfigurationError: The model has no gravity or cannot be used, or a name does not exist.
     """
 
     def __init__(
@@ -56,6 +56,10 @@ class StaticArm:
         end_effector: str | None = None,
         payload: str | None = None,
     ) -> None:
+        if not model.opt.gravity.any():
+            raise ConfigurationError(
+                "the model has no gravity, so nothing bends its joints; set <option gravity=...>"
+            )
         self.model = model
         self.joints = tuple(joints)
         # rigid: it lends its torque, in which springs, `gravcomp` and held joints are taken into
@@ -86,17 +90,6 @@ class StaticArm:
     def up(self) -> Array:
         """Unit vector against gravity in the world frame, (3,)."""
         return -self.model.opt.gravity / np.linalg.norm(self.model.opt.gravity)
-
-    def require_gravity(self) -> None:
-        """Refuse a model in which nothing bends a joint.
-
-        Raises:
-            ConfigurationError: It has no gravity.
-        """
-        if not self.model.opt.gravity.any():
-            raise ConfigurationError(
-                "the model has no gravity, so nothing bends its joints; set <option gravity=...>"
-            )
 
     def torque(self, q: Array) -> Array:
         """Torque that holds the arm without payload, (N, n) [rad] to (N, n) [N·m]."""

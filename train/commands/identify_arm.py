@@ -310,7 +310,6 @@ def _setting(options: ArmOptions, model: mujoco.MjModel, console: Console, seed:
         log = read_log(Path(options.log[0]), ranges, options.measured_by)
     joints = commanded_hinges(model) if log is None else log.joints
     arm = StaticArm(model, joints, options.end_effector, options.payload)
-    arm.require_gravity()
     if log is None:
         log = empty_log(arm, options.measured_by or "end_effector")
     if options.end_effector is None and log.kind in ("end_effector", "imu"):
