@@ -632,6 +632,22 @@ def test_options_that_do_not_go_together_are_refused(
     assert said in " ".join(capsys.readouterr().err.split())
 
 
+def test_a_gain_of_one_is_a_gain(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches a register at 1 that counts as one that nobody has said."""
+    monkeypatch.setattr("train.commands.identify_servo.fit_servo", quick_fit)
+    monkeypatch.chdir(tmp_path)
+    for i, log in enumerate(short_logs(7)[1][:2], 1):
+        columns = {"time": log.time, "goal": log.goal, "position": log.position}
+        csv_of(tmp_path / f"{i}.csv", **columns, gain=np.full(len(log), float(i)))
+    pendulum = ["--mass-kg", "0.5", "--lever-m", "0.1"]
+    main(["identify", "--log", "1.csv", "2.csv", *pendulum, "--holdout", "0"])
+    said = capsys.readouterr().out
+    assert "k_p at gain 1 " in said
+    assert "say it by --gain" not in said
+
+
 @pytest.mark.parametrize("name", ["./b.csv", "copy.csv"])
 def test_a_log_that_is_named_twice_is_left_out_of_the_fit(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -740,7 +756,7 @@ def test_a_log_that_says_no_gain_is_not_of_a_gain_of_one(tmp_path: Path) -> None
     """Catches a value of the register that nobody has given, and nothing on how to give it."""
     _, logs = short_logs(3)
     one = np.ones(len(NAMES))
-    logs = [replace(log, gain=1.0) for log in logs]
+    logs = [replace(log, gain=None) for log in logs]
     result = describe_servo(ServoFit(tuple(logs), one, one, one > 0.0, {}, 1e-3), "j")
     assert [own.register_value for own in result.gains] == [None]
     assert any("log a column gain, or say it by --gain" in text for text in result.untold)

@@ -158,7 +158,7 @@ def _of_log(log: ServoLog, errors: Array, slow: Array) -> LogErrors:
     on = log.enabled if log.enabled.any() else np.ones(len(log), dtype=np.bool_)
     return LogErrors(
         log=log.name,
-        gain=log.gain,
+        gain=log.register,
         rms_mrad=tuple(_mrad(error[on]) for error in errors),
         slow_mrad=tuple(map(_mrad, slow)) if slow.size else None,
         slow_rows=slow.shape[1],

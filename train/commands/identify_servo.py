@@ -56,8 +56,8 @@ def identify_servo(
 
     logs = list(map(read, paths))
     further = list(map(read, servo.unfitted))
-    _require_alike("supply voltage", [log.supply for log in (*logs, *further)])
-    _require_alike("gain", [log.gain for log in (*logs, *further) if log.enabled.any()])
+    _require_alike("supply voltage", [log.supply == 1.0 for log in (*logs, *further)])
+    _require_alike("gain", [log.gain is None for log in (*logs, *further) if log.enabled.any()])
     inner = logs
     outer = further
     if not further and options.judged.holdout:
@@ -223,9 +223,9 @@ def _each_once(paths: Sequence[str]) -> dict[str, set[Path | str]]:
     return seen
 
 
-def _require_alike(what: str, values: Sequence[float]) -> None:
-    """Refuse logs of which only some say a value; it is 1 where they do not."""
-    if len({value == 1.0 for value in values}) > 1:
+def _require_alike(what: str, lacks: Sequence[bool]) -> None:
+    """Refuse logs of which only some say a value."""
+    if len(set(lacks)) > 1:
         raise ConfigurationError(
             f"some logs say their {what} and some do not; give it in all or in none"
         )
