@@ -430,6 +430,26 @@ def test_the_tracker_is_aligned_before_the_fit(geometry: GeometryModel) -> None:
     np.testing.assert_allclose(shown, measured, atol=1e-9)
 
 
+def test_a_body_that_was_written_in_a_frame_keeps_its_place() -> None:
+    """Catches a pose that counts the frame twice, and a link that is decimetres off."""
+    inner = '<body name="side" pos="0.2 0.05 0">'
+    framed = ARM.replace(inner, f'<frame pos="0.1 0 0" euler="0 0 0.3">{inner}')
+    framed = framed.replace("</body></body></body></world", "</body></frame></body></body></world")
+    spec = mujoco.MjSpec.from_string(framed)
+    model = spec.compile()
+    tree = Tree.of(model, JOINTS, {})
+    hand = model.site("hand")
+    arm = GeometryModel.of(
+        tree, JOINTS, model.opt.gravity, [("hand", int(hand.bodyid[0]), hand.pos)]
+    )
+    _, theta = draw(3)
+    measured = arm.predict_markers(arm.nominal_parameters(), theta)
+    fit = fit_geometry(GeometryProblem(arm, theta, measured, JOINTS))
+    corrected = correct_model(spec, tree, fit).compile()
+    np.testing.assert_allclose(corrected.body_pos, model.body_pos, atol=1e-12)
+    np.testing.assert_allclose(corrected.body_quat, model.body_quat, atol=1e-12)
+
+
 def test_joints_that_are_not_in_the_log_stand_where_the_keyframe_has_them() -> None:
     """Catches markers behind a joint that is held elsewhere than the compensator holds it."""
     key = '<keyframe><key qpos="0 0 0 0.8"/></keyframe></mujoco>'

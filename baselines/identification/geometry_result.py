@@ -118,6 +118,8 @@ def correct_model(spec: mujoco.MjSpec, tree: Tree, fit: GeometryFit) -> mujoco.M
         anchor = R.T @ (problem.model.anchor[j] - tree.place[above])
         shift = R.T @ problem.model.nominal[j] @ fit.parameters.length[j]
         own = corrected.body(model.body(body).name)
+        if own.frame is not None:  # the pose is in the parent, whatever frame it was written in
+            own.set_frame(own.parent.add_frame())
         own.pos = anchor + shift + turn @ (model.body_pos[body] - anchor)
         own.quat = _quaternion(turn @ _matrix(model.body_quat[body]))
         own.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
