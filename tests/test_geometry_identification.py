@@ -29,6 +29,7 @@ from baselines.identification.pose_log import PoseLog, read_log, write_poses
 from elastic_env.core.errors import ConfigurationError, ElasticError
 from elastic_env.core.signals import Array
 from elastic_env.core.yaml_text import parse_yaml
+from elastic_env.joint.model_file import compiled_model
 from elastic_env.rigid.tree.links import Tree
 from tests import test_arm_identification
 from train.commands.cli import main
@@ -428,6 +429,25 @@ def test_the_tracker_is_aligned_before_the_fit(geometry: GeometryModel) -> None:
     own = GeometryProblem(geometry, theta, measured, JOINTS).align().model
     shown = own.predict_markers(own.nominal_parameters(), theta)
     np.testing.assert_allclose(shown, measured, atol=1e-9)
+
+
+def test_the_written_model_finds_its_meshes(geometry: GeometryModel, tmp_path: Path) -> None:
+    """Catches a folder of meshes beside the user's model, which the results do not have."""
+    (tmp_path / "shapes").mkdir()
+    corners = "v 0 0 0\nv 0.1 0 0\nv 0 0.1 0\nv 0 0 0.1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+    (tmp_path / "shapes" / "wedge.obj").write_text(corners)
+    wedge = '<asset><mesh name="wedge" file="wedge.obj"/></asset><worldbody>'
+    text = ARM.replace("<worldbody>", wedge, 1).replace(
+        "<compiler", '<compiler meshdir="shapes"', 1
+    )
+    hand = '<site name="hand"'
+    text = text.replace(hand, f'<geom type="mesh" mesh="wedge" mass="0.1"/>{hand}')
+    (tmp_path / "arm.xml").write_text(text)
+    problem, _ = made_up(geometry, 7, count=20, noise_m=3e-4)
+    log = log_of(tmp_path, problem)
+    asked = ["identify", "--robot", str(tmp_path / "arm.xml"), "--log", str(log), "--holdout", "0"]
+    main([*asked, "--output", str(tmp_path / "out")])
+    assert compiled_model(str(tmp_path / "out" / "model.xml")).nmesh == 1
 
 
 def test_a_body_that_was_written_in_a_frame_keeps_its_place() -> None:

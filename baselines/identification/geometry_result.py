@@ -91,7 +91,8 @@ def describe_geometry(fit: GeometryFit, held_out: HeldOut | None) -> GeometryIde
 def correct_model(spec: mujoco.MjSpec, tree: Tree, fit: GeometryFit) -> mujoco.MjSpec:
     """A copy of a model with the identified lengths and angles.
 
-    Encoder offsets are no part of a model: subtract them from what the encoders read.
+    It finds meshes and textures wherever it is written to. Encoder offsets are no part of a model:
+    subtract them from what the encoders read.
 
     Args:
         spec: Specification of the rigid model.
@@ -102,6 +103,10 @@ def correct_model(spec: mujoco.MjSpec, tree: Tree, fit: GeometryFit) -> mujoco.M
         ConfigurationError: A body has two hinges.
     """
     corrected = spec.copy()
+    if spec.meshes:
+        corrected.meshdir = str(Path(spec.modelfiledir, spec.meshdir).resolve())
+    if spec.textures:
+        corrected.texturedir = str(Path(spec.modelfiledir, spec.texturedir).resolve())
     model = spec.compile()
     problem = fit.problem
     for j, joint in enumerate(problem.joints):
