@@ -185,8 +185,22 @@ def test_a_joint_that_gravity_almost_overcomes_still_rests(geometry: GeometryMod
     assert 0.8 < abs(kappa) < 1.0
 
 
-def test_the_corrected_model_is_the_identified_arm(tree: Tree, geometry: GeometryModel) -> None:
-    """Catches a correction in the frame of another body."""
+@pytest.mark.parametrize(
+    "text",
+    [
+        ARM,
+        ARM.replace('name="upper"', "").replace('name="side"', ""),
+        ARM.replace(
+            '<body name="side" pos="0.2', '<frame pos="0.1 0 0"><body name="side" pos="0.1'
+        ).replace("</body></body></body></world", "</body></frame></body></body></world"),
+    ],
+    ids=["named", "without names", "within a frame"],
+)
+def test_the_corrected_model_is_the_identified_arm(
+    tree: Tree, geometry: GeometryModel, text: str
+) -> None:
+    """Catches a correction in the frame of another body, one that a body without a name does not
+    get, and a body that a frame moves a second time."""
     generator, theta = draw(3)
     problem = GeometryProblem(
         geometry,
@@ -199,7 +213,7 @@ def test_the_corrected_model_is_the_identified_arm(tree: Tree, geometry: Geometr
     fit = fit_geometry(problem)
     fit = type(fit)(problem, x, fit.covariance, fit.noise_m)
     own = fit.parameters
-    corrected = correct_model(mujoco.MjSpec.from_string(ARM), tree, fit).compile()
+    corrected = correct_model(mujoco.MjSpec.from_string(text), tree, fit).compile()
     data = mujoco.MjData(corrected)
     unmoved = own._replace(marker=np.zeros_like(own.marker))
     places = geometry.posture(unmoved, theta).marker
@@ -448,26 +462,6 @@ def test_the_written_model_finds_its_meshes(geometry: GeometryModel, tmp_path: P
     asked = ["identify", "--robot", str(tmp_path / "arm.xml"), "--log", str(log), "--holdout", "0"]
     main([*asked, "--output", str(tmp_path / "out")])
     assert compiled_model(str(tmp_path / "out" / "model.xml")).nmesh == 1
-
-
-def test_a_body_that_was_written_in_a_frame_keeps_its_place() -> None:
-    """Catches a pose that counts the frame twice, and a link that is decimetres off."""
-    inner = '<body name="side" pos="0.2 0.05 0">'
-    framed = ARM.replace(inner, f'<frame pos="0.1 0 0" euler="0 0 0.3">{inner}')
-    framed = framed.replace("</body></body></body></world", "</body></frame></body></body></world")
-    spec = mujoco.MjSpec.from_string(framed)
-    model = spec.compile()
-    tree = Tree.of(model, JOINTS, {})
-    hand = model.site("hand")
-    arm = GeometryModel.of(
-        tree, JOINTS, model.opt.gravity, [("hand", int(hand.bodyid[0]), hand.pos)]
-    )
-    _, theta = draw(3)
-    measured = arm.predict_markers(arm.nominal_parameters(), theta)
-    fit = fit_geometry(GeometryProblem(arm, theta, measured, JOINTS))
-    corrected = correct_model(spec, tree, fit).compile()
-    np.testing.assert_allclose(corrected.body_pos, model.body_pos, atol=1e-12)
-    np.testing.assert_allclose(corrected.body_quat, model.body_quat, atol=1e-12)
 
 
 def test_joints_that_are_not_in_the_log_stand_where_the_keyframe_has_them() -> None:

@@ -102,12 +102,13 @@ def correct_model(spec: mujoco.MjSpec, tree: Tree, fit: GeometryFit) -> mujoco.M
     Raises:
         ConfigurationError: A body has two hinges.
     """
+    model = spec.compile()
     corrected = spec.copy()
+    bodies = sorted(corrected.bodies, key=lambda body: body.id)
     if spec.meshes:
         corrected.meshdir = str(Path(spec.modelfiledir, spec.meshdir).resolve())
     if spec.textures:
         corrected.texturedir = str(Path(spec.modelfiledir, spec.texturedir).resolve())
-    model = spec.compile()
     problem = fit.problem
     for j, joint in enumerate(problem.joints):
         body = int(model.joint(joint).bodyid[0])
@@ -122,7 +123,7 @@ def correct_model(spec: mujoco.MjSpec, tree: Tree, fit: GeometryFit) -> mujoco.M
         turn = R.T @ turn @ problem.model.nominal[j].T @ R
         anchor = R.T @ (problem.model.anchor[j] - tree.place[above])
         shift = R.T @ problem.model.nominal[j] @ fit.parameters.length[j]
-        own = corrected.body(model.body(body).name)
+        own = bodies[body]
         if own.frame is not None:  # the pose is in the parent, whatever frame it was written in
             own.set_frame(own.parent.add_frame())
         own.pos = anchor + shift + turn @ (model.body_pos[body] - anchor)
