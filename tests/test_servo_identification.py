@@ -128,6 +128,16 @@ def test_replay_without_friction_agrees_with_mujoco() -> None:
     np.testing.assert_allclose(Replay.of(log).play(own), expected, atol=2e-4)
 
 
+def test_the_other_joints_of_a_robot_stand_where_its_keyframe_has_them() -> None:
+    """Catches another pose than the one in which the compensator holds them."""
+    link = '<inertial pos="0 0 -0.1" mass="0.2" diaginertia="1e-4 1e-4 1e-4"/>'
+    model = mujoco.MjModel.from_xml_string(f"""<mujoco><compiler angle="radian"/><worldbody>
+    <body><joint name="shoulder" axis="0 1 0"/>{link}<body pos="0 0 -0.2">
+    <joint name="elbow" axis="0 1 0"/>{link}</body></body></worldbody>
+    <keyframe><key qpos="0.5 0"/></keyframe></mujoco>""")
+    assert Load.of_joint(model, "elbow").rest == pytest.approx(-0.5)
+
+
 @settings(max_examples=30, deadline=None)
 @given(st.floats(0.1, 5.0), st.floats(0.0, 0.8), st.floats(0.0, 0.3), st.floats(0.0, 0.5))
 def test_no_torque_no_goal_gains_energy(start: float, c: float, F: float, Fs: float) -> None:
