@@ -210,6 +210,15 @@ def _three(c: dict[str, Array]) -> None:
         c[name] = c[name][:3]
 
 
+def _twice(c: dict[str, Array]) -> None:
+    c["goal [rad]"] = c["goal"]
+
+
+def _of_two_joints(c: dict[str, Array]) -> None:
+    c["tau_known.a"] = c["goal"]
+    c["tau_known.b"] = c["goal"]
+
+
 def _unit(c: dict[str, Array]) -> None:
     c["position [deg/s]"] = c.pop("position")
 
@@ -227,6 +236,8 @@ BAD: dict[str, tuple[Callable[[dict[str, Array]], object], str]] = {
     "wrapped": (_wrap, "unwrap"),
     "exchanged": (_swap, "exchanged"),
     "three rows": (_three, "3 rows"),
+    "goal twice": (_twice, "several columns goal; keep one"),
+    "two joints": (_of_two_joints, "several columns tau_known; name the joint by --joints"),
     "constant goal": (_set("goal", lambda g: 0.0 * g), "constant"),
     "joint that stands": (_set("position", lambda q: 0.0 * q), "moves by"),
     "no position": (lambda c: c.pop("position") is None, "no column position"),
