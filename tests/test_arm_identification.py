@@ -672,6 +672,14 @@ def test_joints_of_any_name_are_read_back(names: list[str]) -> None:
         assert list(parse_yaml(file.read_text(encoding="utf-8"))) == names
 
 
+def test_a_joint_whose_name_ends_in_brackets_is_read_back() -> None:
+    """Catches a part of the name that is taken for the unit."""
+    columns = {f"{what}.j[1]": np.array([-1.0, 1.0]) for what in ("theta", "q", "direction")}
+    log = read_log(write_poses(Path("log.csv"), columns), {"j[1]": (-2.0, 2.0)})
+    assert log.joints == ("j[1]",)
+    np.testing.assert_array_equal(log.direction, [[-1.0], [1.0]])
+
+
 def test_first_poses_are_planned_without_a_log(capsys: pytest.CaptureFixture[str]) -> None:
     """Catches a plan that needs what it is made for, and one that promises a joint that gravity
     does not load."""
