@@ -672,6 +672,14 @@ def test_joints_of_any_name_are_read_back(names: list[str]) -> None:
         assert list(parse_yaml(file.read_text(encoding="utf-8"))) == names
 
 
+def test_a_joint_whose_name_ends_in_brackets_is_read_back() -> None:
+    """Catches a part of the name that is taken for the unit."""
+    columns = {f"{what}.j[1]": np.array([-1.0, 1.0]) for what in ("theta", "q", "direction")}
+    log = read_log(write_poses(Path("log.csv"), columns), {"j[1]": (-2.0, 2.0)})
+    assert log.joints == ("j[1]",)
+    np.testing.assert_array_equal(log.direction, [[-1.0], [1.0]])
+
+
 def test_first_poses_are_planned_without_a_log(capsys: pytest.CaptureFixture[str]) -> None:
     """Catches a plan that needs what it is made for, and one that promises a joint that gravity
     does not load."""
@@ -828,6 +836,19 @@ def test_bad_log_is_one_sentence_that_says_what_to_do(
     assert not Path("runs").exists()
 
 
+def test_degrees_are_named_where_a_joint_has_no_range(capsys: pytest.CaptureFixture[str]) -> None:
+    """Exporters write a hundred turns and more for a joint without a limit: catches degrees that
+    are taken for radians."""
+    elbow = '"elbow" axis="0 1 0" range="-2.4 2.4"'
+    free = (FOLDER / "arm.xml").read_text().replace(elbow, elbow.replace("2.4", "1e9"))
+    Path("free.xml").write_text(free)
+    with Path("bad.csv").open("w", newline="") as file:
+        csv.writer(file).writerows(changed("theta.elbow", lambda v: str(math.degrees(float(v)))))
+    with pytest.raises(SystemExit):
+        main(["identify", "--robot", "free.xml", "--log", "bad.csv", "--end-effector", "marker"])
+    assert "look like degrees" in " ".join(capsys.readouterr().err.split())
+
+
 REFUSED: Mapping[str, tuple[list[str], list[str]]] = {
     "missing log": (["--log", "none.csv"], ["no log at none.csv"]),
     "neither": ([], ["--log", "--plan", "--measured-by"]),
@@ -852,6 +873,26 @@ def test_wrong_option_says_what_and_which_choices(
     assert ended.value.code == 2
     assert [word for word in words if word not in said] == []
     assert not Path("runs").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--measured-by", "imu", "--geometry", "dh"], "needs positions"),
+        (["--measured-by", "end_effector", "--lateral"], "--lateral: for a fit of the geometry"),
+        (["--measured-by", "end_effector", "--free", "elbow"], "--free: for a fit of the geometry"),
+    ],
+)
+def test_a_geometry_needs_positions_and_is_asked_for(
+    options: list[str], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Catches a traceback, and options of the geometry that are dropped without a word."""
+    with Path("log.csv").open("w", newline="") as file:
+        csv.writer(file).writerows(both_kinds())
+    with pytest.raises(SystemExit) as ended:
+        run("--log", "log.csv", *options)
+    assert ended.value.code == 2
+    assert said in " ".join(capsys.readouterr().err.split())
 
 
 def test_a_log_that_no_springs_explain_is_refused() -> None:

@@ -10,7 +10,6 @@ import pytest
 from baselines.identification.geometry_fit import (
     QUANTILE,
     GeometryProblem,
-    align_tracker,
     fit_geometry,
 )
 from baselines.identification.geometry_model import AxialTorques, GeometryModel, Parameters
@@ -26,9 +25,11 @@ from baselines.identification.holdout import (
     predict_linear,
     split,
 )
-from baselines.identification.pose_log import read_log, write_poses
+from baselines.identification.pose_log import PoseLog, read_log, write_poses
 from elastic_env.core.errors import ConfigurationError, ElasticError
 from elastic_env.core.signals import Array
+from elastic_env.core.yaml_text import parse_yaml
+from elastic_env.joint.model_file import compiled_model
 from elastic_env.rigid.tree.links import Tree
 from tests import test_arm_identification
 from train.commands.cli import main
@@ -184,8 +185,22 @@ def test_a_joint_that_gravity_almost_overcomes_still_rests(geometry: GeometryMod
     assert 0.8 < abs(kappa) < 1.0
 
 
-def test_the_corrected_model_is_the_identified_arm(tree: Tree, geometry: GeometryModel) -> None:
-    """Catches a correction in the frame of another body."""
+@pytest.mark.parametrize(
+    "text",
+    [
+        ARM,
+        ARM.replace('name="upper"', "").replace('name="side"', ""),
+        ARM.replace(
+            '<body name="side" pos="0.2', '<frame pos="0.1 0 0"><body name="side" pos="0.1'
+        ).replace("</body></body></body></world", "</body></frame></body></body></world"),
+    ],
+    ids=["named", "without names", "within a frame"],
+)
+def test_the_corrected_model_is_the_identified_arm(
+    tree: Tree, geometry: GeometryModel, text: str
+) -> None:
+    """Catches a correction in the frame of another body, one that a body without a name does not
+    get, and a body that a frame moves a second time."""
     generator, theta = draw(3)
     problem = GeometryProblem(
         geometry,
@@ -198,7 +213,7 @@ def test_the_corrected_model_is_the_identified_arm(tree: Tree, geometry: Geometr
     fit = fit_geometry(problem)
     fit = type(fit)(problem, x, fit.covariance, fit.noise_m)
     own = fit.parameters
-    corrected = correct_model(mujoco.MjSpec.from_string(ARM), tree, fit).compile()
+    corrected = correct_model(mujoco.MjSpec.from_string(text), tree, fit).compile()
     data = mujoco.MjData(corrected)
     unmoved = own._replace(marker=np.zeros_like(own.marker))
     places = geometry.posture(unmoved, theta).marker
@@ -217,9 +232,10 @@ def made_up(
     problem = GeometryProblem(arm, theta, blank, JOINTS, elastic=JOINTS, **options)  # type: ignore[arg-type]
     prior = problem.unknowns.prior
     truth = prior * generator.standard_normal(len(prior))
-    for kind in ("translation", "rotation", "marker"):
-        truth[problem.unknowns.part(kind)] *= 0.1  # what an alignment leaves
-    own = problem.unknowns.part("compliance")
+    kinds = np.array(problem.unknowns.kinds)
+    # what an alignment leaves
+    truth[np.isin(kinds, ["translation", "rotation", "marker"])] *= 0.1
+    own = np.flatnonzero(kinds == "compliance")
     truth[own] = prior[own] * generator.uniform(0.1, 0.6, len(own))
     shown = arm.predict_markers(problem.parameters(truth), theta, problem.axial)
     measured = shown + noise_m * generator.standard_normal(blank.shape)
@@ -371,6 +387,8 @@ def test_the_command_identifies_and_its_files_hold(
     out = tmp_path / "out"
     asked = ["identify", "--robot", str(model), "--log", str(log), "--geometry", "dh"]
     main([*asked, "--output", str(out)])
+    config = parse_yaml((out / "config.yaml").read_text())
+    assert (config["robot"], config["log"]) == (str(model), [str(log)])
     said = capsys.readouterr().out
     assert "held out" in said
     assert "keep their prior" in said
@@ -422,9 +440,46 @@ def test_the_tracker_is_aligned_before_the_fit(geometry: GeometryModel) -> None:
         rotation=np.array([0.0, 0.0, 3.0]), translation=np.array([1.0, -2.0, 0.5])
     )
     measured = geometry.predict_markers(turned, theta)
-    own = align_tracker(geometry, theta, measured)
+    own = GeometryProblem(geometry, theta, measured, JOINTS).align().model
     shown = own.predict_markers(own.nominal_parameters(), theta)
     np.testing.assert_allclose(shown, measured, atol=1e-9)
+
+
+def test_the_written_model_finds_its_meshes(geometry: GeometryModel, tmp_path: Path) -> None:
+    """Catches a folder of meshes beside the user's model, which the results do not have."""
+    (tmp_path / "shapes").mkdir()
+    corners = "v 0 0 0\nv 0.1 0 0\nv 0 0.1 0\nv 0 0 0.1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+    (tmp_path / "shapes" / "wedge.obj").write_text(corners)
+    wedge = '<asset><mesh name="wedge" file="wedge.obj"/></asset><worldbody>'
+    text = ARM.replace("<worldbody>", wedge, 1).replace(
+        "<compiler", '<compiler meshdir="shapes"', 1
+    )
+    hand = '<site name="hand"'
+    text = text.replace(hand, f'<geom type="mesh" mesh="wedge" mass="0.1"/>{hand}')
+    (tmp_path / "arm.xml").write_text(text)
+    problem, _ = made_up(geometry, 7, count=20, noise_m=3e-4)
+    log = log_of(tmp_path, problem)
+    asked = ["identify", "--robot", str(tmp_path / "arm.xml"), "--log", str(log), "--holdout", "0"]
+    main([*asked, "--output", str(tmp_path / "out")])
+    assert compiled_model(str(tmp_path / "out" / "model.xml")).nmesh == 1
+
+
+def test_joints_that_are_not_in_the_log_stand_where_the_keyframe_has_them() -> None:
+    """Catches markers behind a joint that is held elsewhere than the compensator holds it."""
+    key = '<keyframe><key qpos="0 0 0 0.8"/></keyframe></mujoco>'
+    model = mujoco.MjModel.from_xml_string(ARM.replace("</mujoco>", key))
+    data = mujoco.MjData(model)
+    theta = draw(4, 12)[1]
+    measured = []
+    for row in theta:
+        data.qpos[:] = [*row[:3], 0.8]
+        mujoco.mj_forward(model, data)
+        measured.append(np.ravel([data.site(name).xpos for name in SITES]))
+    columns = tuple(f"{name}.{axis}" for name in SITES for axis in "xyz")
+    log = PoseLog(JOINTS[:3], theta[:, :3], "markers", columns, np.array(measured))
+    problem, _ = pose_problem(GeometryOptions(), model, log, (), "hand")
+    nothing = np.zeros(len(problem.unknowns.prior))
+    np.testing.assert_allclose(problem.residual(nothing), 0.0, atol=1e-9)
 
 
 def test_folds_hold_out_each_pose_once(geometry: GeometryModel) -> None:
@@ -439,7 +494,15 @@ def test_folds_hold_out_each_pose_once(geometry: GeometryModel) -> None:
 
 
 @pytest.mark.parametrize(
-    "option", ["--plan 20", "--payload hand", "--assume 900", "--end-effector hand"]
+    "option",
+    [
+        "--plan 20",
+        "--payload hand",
+        "--assume 900",
+        "--end-effector hand",
+        "--frame known",
+        "--within 0.1",
+    ],
 )
 def test_an_option_without_use_is_refused(
     geometry: GeometryModel, tmp_path: Path, capsys: pytest.CaptureFixture[str], option: str
@@ -458,7 +521,7 @@ def test_millimetres_are_named(geometry: GeometryModel) -> None:
     """Catches a fit that takes them for metres, and gives up after minutes."""
     problem, _ = made_up(geometry, 7, count=20, noise_m=3e-4)
     with pytest.raises(ConfigurationError, match="convert millimetres to metres"):
-        align_tracker(geometry, problem.theta, 1e3 * problem.measured)
+        replace(problem, measured=1e3 * problem.measured).align()
 
 
 def test_a_joint_that_gravity_does_not_load_is_rigid(geometry: GeometryModel) -> None:

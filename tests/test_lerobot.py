@@ -15,7 +15,7 @@ import pytest
 from baselines import PositionCompensator
 from baselines.lerobot import ArmSettings, LeRobotArm, read_calibration
 from baselines.lerobot.arm import units_of
-from baselines.lerobot.settings import JointPlace, Motor, MotorCalibration, motors_of, robot_types
+from baselines.lerobot.settings import JointPlace, Motor, MotorCalibration, known_motors, motors_of
 from elastic_env.core.errors import ActionError, ConfigurationError
 
 FOLDER = Path("docs/hardware")
@@ -110,7 +110,7 @@ def test_motors_without_counts_are_in_degrees_whatever_their_calibration_says() 
 
 def test_every_robot_has_its_own_names_and_default_units() -> None:
     """As lerobot 0.4.4 has them; tests/lerobot compares with the package."""
-    assert {name: {motor.units for motor in motors_of(name)} for name in robot_types()} == {
+    assert {name: {motor.units for motor in motors_of(name)} for name in known_motors()} == {
         "so100_follower": {"degrees", "percent"},
         "so101_follower": {"degrees", "percent"},
         "koch_follower": {"range", "percent"},

@@ -147,7 +147,7 @@ def test_the_known_torque_is_that_of_weight_and_of_the_other_joints(tmp_path: Pa
     body = arm.compensator.constants.body
     inside = slice(10, -10)  # the derivatives at the ends are one-sided
     logs = joint_logs(recording, arm)
-    assert [log.joint for log in logs] == list(BODY)
+    assert [log.name for log in logs] == [f"{name}_0" for name in BODY]
     model = arm.compensator.constants.model
     data = mujoco.MjData(model)
     matrices = np.zeros((len(q), model.nv, model.nv))
@@ -156,15 +156,15 @@ def test_the_known_torque_is_that_of_weight_and_of_the_other_joints(tmp_path: Pa
         mujoco.mj_forward(model, data)
         mujoco.mj_fullM(model, data, matrix)
     for joint, log in enumerate(logs):
-        dof = model.joint(log.joint).dofadr[0]
+        assert log.load.inertia is not None
+        assert log.known is not None
+        dof = model.joint(BODY[joint]).dofadr[0]
         own = np.mean(matrices[:, dof, dof]) - model.dof_armature[dof]
-        assert log.inertia == pytest.approx(own, rel=0.01)
-        expected = log.inertia * q_ddot - body.inverse_dynamics(q, q_dot, q_ddot)
+        assert log.load.inertia == pytest.approx(own, rel=0.01)
+        expected = log.load.inertia * q_ddot - body.inverse_dynamics(q, q_dot, q_ddot)
         expected = expected[:, joint]
         largest = np.abs(expected).max()
-        np.testing.assert_allclose(
-            log.tau_known[inside], expected[inside], atol=0.01 * largest + 2e-4
-        )
+        np.testing.assert_allclose(log.known[inside], expected[inside], atol=0.01 * largest + 2e-4)
         np.testing.assert_allclose(log.position, q[:, joint], atol=1e-6)
 
 
@@ -205,6 +205,34 @@ def test_a_folder_that_cannot_be_used_is_one_sentence(
     with pytest.raises(ConfigurationError, match=said):  # noqa: PT012  both read it
         robot_of(folder)
         read_recordings(folder, episodes)
+
+
+@pytest.mark.parametrize(
+    "clock", [[0.0], [0.0, 0.1], [0.0] * 3, [0.2, 0.1, 0.0], [0.0, 0.1, 0.2, 1e9]]
+)
+def test_an_episode_without_a_clock_is_one_sentence(clock: list[float], tmp_path: Path) -> None:
+    """Catches a traceback, and a memory that a gap fills."""
+    folder = dataset(tmp_path / "set", "v2.1")
+    file = folder / "data" / "chunk-000" / "episode_000001.parquet"
+    state = [[0.0] * 6] * len(clock)
+    columns = {"timestamp": clock, "action": state, "observation.state": state}
+    pd.DataFrame({**columns, "episode_index": [1] * len(clock)}).to_parquet(file)
+    with pytest.raises(ConfigurationError, match="episode 1: needs at least 3 rows"):
+        read_recordings(folder)
+    assert len(read_recordings(folder, [0])) == 1
+
+
+def test_a_joint_with_a_slash_in_its_name_has_its_file(tmp_path: Path) -> None:
+    """Catches a folder that is not there, behind a prefix of a model that was attached."""
+    named = '<joint name="elbow_flex"', '<joint name="arm/elbow_flex"'
+    (tmp_path / "arm.xml").write_text(Path("docs/hardware/so101.xml").read_text().replace(*named))
+    (tmp_path / "arm.json").write_text(json.dumps(calibration()))
+    (tmp_path / "places.yaml").write_text("elbow_flex: {joint: arm/elbow_flex}")
+    arguments = ["lerobot", str(dataset(tmp_path / "set")), "--output", str(tmp_path / "logs")]
+    for option, file in (("model", "arm.xml"), ("calibration", "arm.json")):
+        arguments += [f"--{option}", str(tmp_path / file)]
+    main([*arguments, "--places", str(tmp_path / "places.yaml")])
+    assert (tmp_path / "logs" / "arm_elbow_flex_1.csv").is_file()
 
 
 def test_no_data_set_is_one_sentence(tmp_path: Path) -> None:

@@ -32,6 +32,7 @@ from docs.pages.recorded import priors
 from docs.recorded.servos import FURTHER_SEEDS, servo_figures, servo_rows
 from elastic_env.core.errors import ConfigurationError, ElasticError, MissingExtraError
 from elastic_env.core.signals import Array
+from elastic_env.core.yaml_text import parse_yaml
 from elastic_env.joint.joint_settings import read_joints
 from tests.servo_trials import SOUGHT, draw_servo, holds, make_logs
 from train.commands.cli import main
@@ -127,6 +128,16 @@ def test_replay_without_friction_agrees_with_mujoco() -> None:
     np.testing.assert_allclose(Replay.of(log).play(own), expected, atol=2e-4)
 
 
+def test_the_other_joints_of_a_robot_stand_where_its_keyframe_has_them() -> None:
+    """Catches another pose than the one in which the compensator holds them."""
+    link = '<inertial pos="0 0 -0.1" mass="0.2" diaginertia="1e-4 1e-4 1e-4"/>'
+    model = mujoco.MjModel.from_xml_string(f"""<mujoco><compiler angle="radian"/><worldbody>
+    <body><joint name="shoulder" axis="0 1 0"/>{link}<body pos="0 0 -0.2">
+    <joint name="elbow" axis="0 1 0"/>{link}</body></body></worldbody>
+    <keyframe><key qpos="0.5 0"/></keyframe></mujoco>""")
+    assert Load.of_joint(model, "elbow").rest == pytest.approx(-0.5)
+
+
 @settings(max_examples=30, deadline=None)
 @given(st.floats(0.1, 5.0), st.floats(0.0, 0.8), st.floats(0.0, 0.3), st.floats(0.0, 0.5))
 def test_no_torque_no_goal_gains_energy(start: float, c: float, F: float, Fs: float) -> None:
@@ -199,6 +210,15 @@ def _three(c: dict[str, Array]) -> None:
         c[name] = c[name][:3]
 
 
+def _twice(c: dict[str, Array]) -> None:
+    c["goal [rad]"] = c["goal"]
+
+
+def _of_two_joints(c: dict[str, Array]) -> None:
+    c["tau_known.a"] = c["goal"]
+    c["tau_known.b"] = c["goal"]
+
+
 def _unit(c: dict[str, Array]) -> None:
     c["position [deg/s]"] = c.pop("position")
 
@@ -216,6 +236,8 @@ BAD: dict[str, tuple[Callable[[dict[str, Array]], object], str]] = {
     "wrapped": (_wrap, "unwrap"),
     "exchanged": (_swap, "exchanged"),
     "three rows": (_three, "3 rows"),
+    "goal twice": (_twice, "several columns goal; keep one"),
+    "two joints": (_of_two_joints, "several columns tau_known; name the joint by --joints"),
     "constant goal": (_set("goal", lambda g: 0.0 * g), "constant"),
     "joint that stands": (_set("position", lambda q: 0.0 * q), "moves by"),
     "no position": (lambda c: c.pop("position") is None, "no column position"),
@@ -592,6 +614,7 @@ def test_command_reads_a_log_and_writes_what_others_read(
     assert joint.servo.position_gain == pytest.approx(gains, rel=1e-3)
     assert joint.load_friction == pytest.approx(result.value("load_friction"), rel=1e-3)
     assert Path("out/identification.png").stat().st_size > 1000
+    assert parse_yaml(Path("out/config.yaml").read_text())["judged"]["holdout"] == 0.3
 
 
 def quick_fit(logs: Sequence[ServoLog], *rest: object) -> ServoFit:
@@ -628,6 +651,22 @@ def test_options_that_do_not_go_together_are_refused(
         main(["identify", "--log", str(path), *options])
     assert ended.value.code == 2
     assert said in " ".join(capsys.readouterr().err.split())
+
+
+def test_a_gain_of_one_is_a_gain(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches a register at 1 that counts as one that nobody has said."""
+    monkeypatch.setattr("train.commands.identify_servo.fit_servo", quick_fit)
+    monkeypatch.chdir(tmp_path)
+    for i, log in enumerate(short_logs(7)[1][:2], 1):
+        columns = {"time": log.time, "goal": log.goal, "position": log.position}
+        csv_of(tmp_path / f"{i}.csv", **columns, gain=np.full(len(log), float(i)))
+    pendulum = ["--mass-kg", "0.5", "--lever-m", "0.1"]
+    main(["identify", "--log", "1.csv", "2.csv", *pendulum, "--holdout", "0"])
+    said = capsys.readouterr().out
+    assert "k_p at gain 1 " in said
+    assert "say it by --gain" not in said
 
 
 @pytest.mark.parametrize("name", ["./b.csv", "copy.csv"])
@@ -738,7 +777,7 @@ def test_a_log_that_says_no_gain_is_not_of_a_gain_of_one(tmp_path: Path) -> None
     """Catches a value of the register that nobody has given, and nothing on how to give it."""
     _, logs = short_logs(3)
     one = np.ones(len(NAMES))
-    logs = [replace(log, gain=1.0) for log in logs]
+    logs = [replace(log, gain=None) for log in logs]
     result = describe_servo(ServoFit(tuple(logs), one, one, one > 0.0, {}, 1e-3), "j")
     assert [own.register_value for own in result.gains] == [None]
     assert any("log a column gain, or say it by --gain" in text for text in result.untold)

@@ -116,10 +116,6 @@ class Unknowns:
     basis: Array
     prior: Array
 
-    def part(self, kind: str) -> IntArray:
-        """Positions of a kind in x."""
-        return np.flatnonzero([own == kind for own in self.kinds])
-
 
 @dataclass(frozen=True, eq=False)
 class GeometryProblem:
@@ -161,9 +157,25 @@ class GeometryProblem:
         return other
 
     def align(self) -> "GeometryProblem":
-        """The same problem, with the tracker rotated as fits these poses best."""
-        model = align_tracker(self.model, self.theta, self.measured)
-        other = replace(self, model=model)
+        """The same problem, with the tracker rotated as fits rigid nominal poses best.
+
+        Raises:
+            ConfigurationError: The markers spread far more or less than those of the model.
+        """
+        nominal = self.model.nominal_parameters()
+        own = self.model.predict_markers(nominal, self.theta).reshape(-1, 3)
+        shown = self.measured.reshape(-1, 3)
+        own_m, shown_m = (float(np.std(points, axis=0).max()) for points in (own, shown))
+        if not own_m / _UNLIKE < shown_m < own_m * _UNLIKE:
+            raise ConfigurationError(
+                f"the markers spread over {shown_m:.3g} m, those of the model over {own_m:.3g} m:"
+                " convert millimetres to metres, or name the bodies that were measured"
+            )
+        middle = shown.mean(axis=0)
+        own_middle = own.mean(axis=0)
+        R = Rotation.align_vectors(shown - middle, own - own_middle)[0].as_matrix()
+        aligned = replace(self.model, alignment=R, origin=middle - R @ own_middle)
+        other = replace(self, model=aligned)
         other.__dict__["unknowns"] = self.unknowns
         return other
 
@@ -369,28 +381,3 @@ def _least(problem: GeometryProblem, x: Array, noise: float) -> Array:
             " units of the log's columns and the model"
         )
     return prior * found.x
-
-
-def align_tracker(model: GeometryModel, theta: Array, measured: Array) -> GeometryModel:
-    """The model with the rotation of the tracker that fits rigid nominal poses best.
-
-    Args:
-        model: The markers.
-        theta: Motor encoders, (N, n) [rad].
-        measured: Places of the markers, (N, k, 3) [m].
-
-    Raises:
-        ConfigurationError: They spread far more or less than those of the model.
-    """
-    own = model.predict_markers(model.nominal_parameters(), theta).reshape(-1, 3)
-    shown = measured.reshape(-1, 3)
-    own_m, shown_m = (float(np.std(points, axis=0).max()) for points in (own, shown))
-    if not own_m / _UNLIKE < shown_m < own_m * _UNLIKE:
-        raise ConfigurationError(
-            f"the markers spread over {shown_m:.3g} m, those of the model over {own_m:.3g} m:"
-            " convert millimetres to metres, or name the bodies that were measured"
-        )
-    middle = shown.mean(axis=0)
-    own_middle = own.mean(axis=0)
-    R = Rotation.align_vectors(shown - middle, own - own_middle)[0].as_matrix()
-    return replace(model, alignment=R, origin=middle - R @ own_middle)

@@ -496,12 +496,4 @@ def _left_jacobian(vectors: Array) -> Array:
 
 def cross_matrix(vectors: Array) -> Array:
     """Matrices of the cross product with vectors from the left, (..., 3) to (..., 3, 3)."""
-    W = np.zeros((*np.shape(vectors), 3))
-    x, y, z = np.moveaxis(vectors, -1, 0)
-    W[..., 0, 1] = -z
-    W[..., 0, 2] = y
-    W[..., 1, 0] = z
-    W[..., 1, 2] = -x
-    W[..., 2, 0] = -y
-    W[..., 2, 1] = x
-    return W
+    return np.cross(np.eye(3), np.expand_dims(vectors, -2))

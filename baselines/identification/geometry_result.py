@@ -91,7 +91,8 @@ def describe_geometry(fit: GeometryFit, held_out: HeldOut | None) -> GeometryIde
 def correct_model(spec: mujoco.MjSpec, tree: Tree, fit: GeometryFit) -> mujoco.MjSpec:
     """A copy of a model with the identified lengths and angles.
 
-    Encoder offsets are no part of a model: subtract them from what the encoders read.
+    It finds meshes and textures wherever it is written to. Encoder offsets are no part of a model:
+    subtract them from what the encoders read.
 
     Args:
         spec: Specification of the rigid model.
@@ -101,8 +102,13 @@ def correct_model(spec: mujoco.MjSpec, tree: Tree, fit: GeometryFit) -> mujoco.M
     Raises:
         ConfigurationError: A body has two hinges.
     """
-    corrected = spec.copy()
     model = spec.compile()
+    corrected = spec.copy()
+    bodies = sorted(corrected.bodies, key=lambda body: body.id)
+    if spec.meshes:
+        corrected.meshdir = str(Path(spec.modelfiledir, spec.meshdir).resolve())
+    if spec.textures:
+        corrected.texturedir = str(Path(spec.modelfiledir, spec.texturedir).resolve())
     problem = fit.problem
     for j, joint in enumerate(problem.joints):
         body = int(model.joint(joint).bodyid[0])
@@ -117,7 +123,9 @@ def correct_model(spec: mujoco.MjSpec, tree: Tree, fit: GeometryFit) -> mujoco.M
         turn = R.T @ turn @ problem.model.nominal[j].T @ R
         anchor = R.T @ (problem.model.anchor[j] - tree.place[above])
         shift = R.T @ problem.model.nominal[j] @ fit.parameters.length[j]
-        own = corrected.body(model.body(body).name)
+        own = bodies[body]
+        if own.frame is not None:  # the pose is in the parent, whatever frame it was written in
+            own.set_frame(own.parent.add_frame())
         own.pos = anchor + shift + turn @ (model.body_pos[body] - anchor)
         own.quat = _quaternion(turn @ _matrix(model.body_quat[body]))
         own.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
@@ -126,19 +134,14 @@ def correct_model(spec: mujoco.MjSpec, tree: Tree, fit: GeometryFit) -> mujoco.M
 
 def _joint(joint: str, estimate: GeometryEstimate | None) -> JointCompliance:
     """Stiffness by a compliance; rigid where it is not sought, not told, or not above zero."""
-    if estimate is None or estimate.value <= 0.0 or not estimate.is_told:
-        return JointCompliance(
-            joint=joint,
-            stiffness_nm_per_rad=math.inf,
-            stiffness_low_nm_per_rad=None,
-            stiffness_high_nm_per_rad=None,
-        )
-    c = estimate.value
-    h = estimate.half_width
+    c = h = 0.0
+    if estimate is not None and estimate.value > 0.0 and estimate.is_told:
+        c = estimate.value
+        h = estimate.half_width
     return JointCompliance(
         joint=joint,
-        stiffness_nm_per_rad=1.0 / c,
-        stiffness_low_nm_per_rad=1.0 / (c + h),
+        stiffness_nm_per_rad=1.0 / c if c else math.inf,
+        stiffness_low_nm_per_rad=1.0 / (c + h) if c else None,
         stiffness_high_nm_per_rad=1.0 / (c - h) if c > h else None,
     )
 

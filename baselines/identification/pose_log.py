@@ -172,7 +172,8 @@ def write_poses(path: Path, columns: Mapping[str, Array]) -> Path:
     header = []
     for name in columns:
         unit = UNITS[name.split(".", 1)[0]]
-        header.append(name if unit == "1" else f"{name} [{unit}]")
+        needs_no_unit = unit == "1" and not name.endswith("]")
+        header.append(name if needs_no_unit else f"{name} [{unit}]")
     table.to_csv(path, header=header, index=False, float_format="%.9g", lineterminator="\n")
     return path
 

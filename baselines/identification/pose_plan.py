@@ -105,22 +105,33 @@ def candidate_poses(
     low, high = np.where(np.isfinite(arm.ranges), arm.ranges, unlimited).T
     middle = 0.5 * (low + high)
     half = 0.5 * _WITHIN * (high - low)
-    touches = _Contacts(shapes, arm.joints)
-    usual = set.intersection(
-        *(touches.of(theta) for theta in (like.theta if len(like) else [middle]))
-    )
+    data = mujoco.MjData(shapes)
+    if shapes.nkey:
+        data.qpos[:] = shapes.key_qpos[0]
+    at = [int(shapes.joint(joint).qposadr[0]) for joint in arm.joints]
+
+    def touching(q: Array) -> set[tuple[int, int]]:
+        """Pairs of bodies that touch at joint angles, (n,) [rad]."""
+        data.qpos[at] = q
+        mujoco.mj_kinematics(shapes, data)
+        mujoco.mj_comPos(shapes, data)
+        mujoco.mj_collision(shapes, data)
+        bodies = shapes.geom_bodyid[data.contact.geom[: data.ncon]]
+        return {(int(min(pair)), int(max(pair))) for pair in bodies}
+
+    usual = set.intersection(*map(touching, like.theta if len(like) else [middle]))
     poses: list[Array] = []
-    for draw in range(_MOST_DRAWS * CANDIDATES):
+    for _ in range(_MOST_DRAWS * CANDIDATES):
         theta = middle + half * generator.uniform(-1.0, 1.0, len(middle))
-        if touches.of(theta) <= usual:
+        if touching(theta) <= usual:
             poses.append(theta)
         if len(poses) == CANDIDATES:
             break
-        if draw == _MOST_DRAWS * CANDIDATES - 1 and len(poses) < CANDIDATES // 10:
-            raise ElasticError(
-                f"only {len(poses)} of {draw + 1} random poses are free of contacts; check joint"
-                " ranges and shapes of the model, or give a model without shapes"
-            )
+    if len(poses) < CANDIDATES // 10:
+        raise ElasticError(
+            f"only {len(poses)} of {_MOST_DRAWS * CANDIDATES} random poses are free of contacts;"
+            " check joint ranges and shapes of the model, or give a model without shapes"
+        )
     theta = np.array(poses)
     sides = None
     if like.direction is not None:
@@ -146,31 +157,6 @@ def _rigid_measurement(arm: StaticArm, like: PoseLog, theta: Array) -> Array:
     if like.kind == "imu":
         return roll_and_pitch(arm.attitude(theta).rotation.transpose(0, 2, 1) @ arm.up)
     return np.zeros((len(theta), len(like.columns)))
-
-
-class _Contacts:
-    """Pairs of bodies that touch.
-
-    Args:
-        model: The arm with its shapes.
-        joints: Order of the angles.
-    """
-
-    def __init__(self, model: mujoco.MjModel, joints: tuple[str, ...]) -> None:
-        self._model = model
-        self._data = mujoco.MjData(model)
-        if model.nkey:
-            self._data.qpos[:] = model.key_qpos[0]
-        self._at = [int(model.joint(joint).qposadr[0]) for joint in joints]
-
-    def of(self, q: Array) -> set[tuple[int, int]]:
-        """Pairs that touch at joint angles, (n,) [rad]."""
-        self._data.qpos[self._at] = q
-        mujoco.mj_kinematics(self._model, self._data)
-        mujoco.mj_comPos(self._model, self._data)
-        mujoco.mj_collision(self._model, self._data)
-        bodies = self._model.geom_bodyid[self._data.contact.geom[: self._data.ncon]]
-        return {(int(min(pair)), int(max(pair))) for pair in bodies}
 
 
 def _chosen(rows: Array, information: Array, count: int, sought: int) -> IntArray:

@@ -127,12 +127,11 @@ def _read_csv(path: Path, joint: str | None) -> Content:
             )
         if unit == "rad":
             units[name] = given
-        name = "known" if known else name
-        if name in columns:
-            raise ConfigurationError(
-                f"{path} has several columns {name}; name the joint by --joints"
-            )
-        columns[name] = values
+        field = "known" if known else name
+        if field in columns:
+            cure = "name the joint by --joints" if known else "keep one of them"
+            raise ConfigurationError(f"{path} has several columns {name.partition('.')[0]}; {cure}")
+        columns[field] = values
     return Content(columns, {}, _angle_unit(path, units))
 
 

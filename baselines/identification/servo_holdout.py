@@ -10,11 +10,7 @@ from elastic_env.core.config import Model
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
 
-GOAL = "the goal itself"
-OFFSET = "a constant offset"
-LINE = "a line in the goal"
-REPLAYED = "identified"
-PREDICTIONS = (GOAL, OFFSET, LINE, REPLAYED)
+PREDICTIONS = ("the goal itself", "a constant offset", "a line in the goal", "identified")
 _FEWEST_HELD_OUT = 20
 
 
@@ -162,7 +158,7 @@ def _of_log(log: ServoLog, errors: Array, slow: Array) -> LogErrors:
     on = log.enabled if log.enabled.any() else np.ones(len(log), dtype=np.bool_)
     return LogErrors(
         log=log.name,
-        gain=log.gain,
+        gain=log.register,
         rms_mrad=tuple(_mrad(error[on]) for error in errors),
         slow_mrad=tuple(map(_mrad, slow)) if slow.size else None,
         slow_rows=slow.shape[1],

@@ -7,7 +7,7 @@ import numpy as np
 
 from elastic_env.core.errors import ConfigurationError, unknown_name
 from elastic_env.core.signals import Array
-from elastic_env.joint.supported_models import hinges_of
+from elastic_env.joint.supported_models import hinges_of, home_of
 
 GRAVITY = 9.80665
 """Standard acceleration of free fall [m/s²]."""
@@ -44,7 +44,9 @@ class Load:
 
     @staticmethod
     def of_joint(model: mujoco.MjModel, joint: str) -> "Load":
-        """Links beyond a hinge of a robot whose other joints stand where the model has them.
+        """Links beyond a hinge of a robot.
+
+        Its other joints stand where its first keyframe has them, or at the reference.
 
         Raises:
             ConfigurationError: The model has no such hinge.
@@ -59,7 +61,7 @@ class Load:
         at = int(hinge.dofadr[0])
         pulls = []
         for angle in (0.0, 0.5 * np.pi):
-            data.qpos[:] = model.qpos0
+            data.qpos[:] = home_of(model)
             data.qpos[hinge.qposadr[0]] = angle
             mujoco.mj_forward(model, data)
             pulls.append(-float(data.qfrc_bias[at]))

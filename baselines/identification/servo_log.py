@@ -42,7 +42,7 @@ class ServoLog:
         goal: Commanded angle, (N,) [rad].
         position: Measured angle, (N,) [rad].
         enabled: True while the servo's torque is on, (N,).
-        gain: Value of the servo's gain register; 1 where none is known [1].
+        gain: Value of the servo's gain register [1]; None where none is known.
         load: What hangs on the joint.
         pwm: Duty of the motor's voltage in any unit, (N,); None if not logged.
         known: Known further torque on the joint, (N,) [N·m]; None if there is none.
@@ -54,7 +54,7 @@ class ServoLog:
     goal: Array
     position: Array
     enabled: BoolArray
-    gain: float = 1.0
+    gain: float | None = None
     load: Load = NO_LOAD
     pwm: Array | None = None
     known: Array | None = None
@@ -62,6 +62,11 @@ class ServoLog:
 
     def __len__(self) -> int:
         return len(self.time)
+
+    @property
+    def register(self) -> float:
+        """Value of the gain register that counts: 1 where none is known."""
+        return 1.0 if self.gain is None else self.gain
 
     def part(self, rows: slice) -> "ServoLog":
         """Some of its rows."""
@@ -220,22 +225,26 @@ def _is_same_load(one: Load, other: Load) -> bool:
 
 def _gain(
     path: Path, gain: float | None, columns: Mapping[str, Array], facts: Mapping[str, float]
-) -> float:
-    """Value of the gain register by option and file.
+) -> float | None:
+    """Value of the gain register by option and file; None where neither says it.
 
     Raises:
-        ConfigurationError: They contradict each other, or it is not positive.
+        ConfigurationError: They contradict each other, or it changes, or is not positive.
     """
     own = facts.get("kp")
     if "gain" in columns:
-        own = _constant_gain(path, columns["gain"])
+        own = float(columns["gain"][0])
+        if np.ptp(columns["gain"]) > 0.0:
+            raise ConfigurationError(
+                f"{path}: the gain changes within the log; give each gain a file of its own"
+            )
     if own is not None and gain is not None and not math.isclose(own, gain, rel_tol=_SAME):
         raise ConfigurationError(
             f"{path} says that the gain is {own:g}, and --gain {gain:g}; leave --gain out, or"
             " correct the file"
         )
-    value = own if own is not None else 1.0 if gain is None else gain
-    if not value > 0.0:
+    value = gain if own is None else own
+    if value is not None and not value > 0.0:
         raise ConfigurationError(f"{path}: the gain must be positive, got {value:g}")
     return value
 
@@ -313,14 +322,6 @@ def _require_plausible_goal(path: Path, log: ServoLog) -> None:
             f"{path}: the joint goes beyond its goal against the load; are goal and position"
             " exchanged, or is a sign or the zero (hanging down) wrong?"
         )
-
-
-def _constant_gain(path: Path, column: Array) -> float:
-    if np.ptp(column) > 0.0:
-        raise ConfigurationError(
-            f"{path}: the gain changes within the log; give each gain a file of its own"
-        )
-    return float(column[0])
 
 
 def _signed(register: Array) -> Array:

@@ -82,7 +82,7 @@ class ServoProblem:
                 "nothing loads the joint; hang a known mass on it, turn its axis out of the"
                 " vertical, or log a column tau_known [N·m]"
             )
-        highest = max(log.gain for log in logs)
+        highest = max(log.register for log in logs)
         inertia = max(log.load.inertia or torque / 100.0 for log in logs)
         span = max((np.ptp(log.goal) for log in logs if log.enabled.any()), default=1.0)
         scale = {
@@ -168,18 +168,16 @@ class ServoProblem:
         """Effects that are sought where they show, each with a start beside parameters z."""
         further = []
         if self.duty is None and any(log.enabled.any() for log in self.logs):
-            further.append({"torque_limit": _SATURATED * self._largest_pull(z)})
+            gain = self.expand(z)[AT["position_gain"]]
+            pulls = [
+                gain * log.register * log.supply * np.abs(log.goal - log.position)[log.enabled]
+                for log in self.logs
+            ]
+            # what the servo would give without a limit
+            largest = float(np.concatenate(pulls).max()) / self.scale[AT["torque_limit"]]
+            further.append({"torque_limit": _SATURATED * largest})
         further.append({"static_friction": 0.5, "stribeck_speed": 1.0})
         return further
-
-    def _largest_pull(self, z: Array) -> float:
-        """Largest torque that the servo would give without a limit, in the unit of the limit."""
-        gain = self.expand(z)[AT["position_gain"]]
-        pulls = [
-            gain * log.gain * log.supply * np.abs(log.goal - log.position)[log.enabled]
-            for log in self.logs
-        ]
-        return float(np.concatenate(pulls).max()) / self.scale[AT["torque_limit"]]
 
     def expand(self, z: Array) -> Array:
         """Parameters of the replay."""
@@ -286,7 +284,7 @@ def duty_per_torque_gain(logs: Sequence[ServoLog]) -> float | None:
     for log in logs:
         if log.pwm is not None:
             inner = log.enabled & (np.abs(log.pwm) < 0.98 * highest)
-            rows.append(log.gain * (log.goal - log.position)[inner])
+            rows.append(log.register * (log.goal - log.position)[inner])
             duty.append(log.pwm[inner])
     error = np.concatenate(rows)
     own = np.concatenate(duty)
@@ -360,7 +358,7 @@ def drive(log: ServoLog, duty: float | None) -> Array:
 
     The register's error is limited before the supply's voltage scales it: the limit is T/k.
     """
-    error = log.gain * (log.goal - log.position)
+    error = log.register * (log.goal - log.position)
     if duty is not None:
         error = np.clip(error, -duty, duty)
     return error * log.supply * log.enabled

@@ -99,7 +99,7 @@ class Replay:
             self.known,
             log.enabled,
             self._switched(parameters[12]),
-            np.array([*self.start, log.gain, log.supply, load.torque, load.rest, inertia]),
+            np.array([*self.start, log.register, log.supply, load.torque, load.rest, inertia]),
             np.ascontiguousarray(parameters, dtype=np.float64),
             out,
         )

@@ -30,9 +30,9 @@ class ServoParameter(Model):
 
     name: str
     unit: str
-    value: float | None
+    value: float | None = None
     """None where it was not sought."""
-    half_width: float | None
+    half_width: float | None = None
     """Half of the interval; None where it follows from an assumption, or was not sought."""
     is_told: bool
     """True if the logs tell it, to half its value or better."""
@@ -128,9 +128,9 @@ def describe_servo(
         rms_mrad=1e3 * fit.rms,
         gains=tuple(
             RegisterGain(
-                register_value=None if register == 1.0 else register,
-                position_gain_nm_per_rad=gain * register * volts,
-                half_width=half * register * volts if np.isfinite(half) else None,
+                register_value=register,
+                position_gain_nm_per_rad=gain * (register or 1.0) * volts,
+                half_width=half * (register or 1.0) * volts if np.isfinite(half) else None,
                 supply_v=None if volts == 1.0 else volts,
             )
             for register, volts in registers
@@ -142,12 +142,12 @@ def describe_servo(
     )
 
 
-def _registers(logs: Sequence[ServoLog]) -> list[tuple[float, float]]:
+def _registers(logs: Sequence[ServoLog]) -> list[tuple[float | None, float]]:
     """Each value of the register at each supply, with the mean voltage of its logs [1], [V].
 
     Voltages that were measured differ a little from log to log, and count as one supply.
     """
-    found: list[tuple[float, list[float]]] = []
+    found: list[tuple[float | None, list[float]]] = []
     for log in logs:
         if not log.enabled.any():
             continue
@@ -169,9 +169,7 @@ def _parameter(fit: ServoFit, name: str, supply: float) -> ServoParameter:
     half = fit.half(name) * scale
     is_known = name in fit.tied or bool(fit.sought[list(PARAMETERS).index(name)])
     if not is_known or not np.isfinite(value):
-        return ServoParameter(
-            name=name, unit=PARAMETERS[name], value=None, half_width=None, is_told=False
-        )
+        return ServoParameter(name=name, unit=PARAMETERS[name], is_told=False)
     has_interval = bool(np.isfinite(half))
     within = _TOLD_WITHIN.get(name, 0.0)
     if name in ("coulomb_friction", "static_friction"):
@@ -195,7 +193,7 @@ def _untold(fit: ServoFit, parameters: Sequence[ServoParameter]) -> list[str]:
     has_torque = any(log.enabled.any() for log in fit.logs)
     if not has_torque:
         said.append("the servo: its torque is never on")
-    elif all(log.gain == 1.0 for log in fit.logs):
+    elif all(log.gain is None for log in fit.logs):
         said.append(
             "at which value of the gain register k_p holds: log a column gain, or say it by --gain"
         )

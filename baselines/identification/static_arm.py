@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from functools import cached_property
 
 import mujoco
 import numpy as np
@@ -10,6 +10,8 @@ import numpy as np
 from baselines.compensation.position_compensator import PositionCompensator
 from elastic_env.core.errors import ConfigurationError, require_known
 from elastic_env.core.signals import Array
+from elastic_env.joint.supported_models import home_of
+from elastic_env.rigid.tree.end_effector import EndEffector, outermost_body
 from elastic_env.world.robot_model import joint_ranges
 
 _STEP_RAD = 1e-4  # of central differences: an error of 1e-9 relative
@@ -38,12 +40,13 @@ class StaticArm:
     Args:
         model: Compiled rigid model on a fixed base.
         joints: Hinges in the order of all arrays; the others are held, see `PositionCompensator`.
-        end_effector: Site or body that is measured; None for the outermost body.
+        end_effector: Site or body that is measured; None for the outermost named body that the
+            joints move.
         payload: Body or site that carries a payload of unknown mass at its origin; None for no
             payload.
 
     Raises:
-        ConfigurationError: The model cannot be used, or a name does not exist.
+        ConfigurationError: The model has no gravity or cannot be used, or a name does not exist.
     """
 
     def __init__(
@@ -53,6 +56,10 @@ class StaticArm:
         end_effector: str | None = None,
         payload: str | None = None,
     ) -> None:
+        if not model.opt.gravity.any():
+            raise ConfigurationError(
+                "the model has no gravity, so nothing bends its joints; set <option gravity=...>"
+            )
         self.model = model
         self.joints = tuple(joints)
         # rigid: it lends its torque, in which springs, `gravcomp` and held joints are taken into
@@ -64,36 +71,25 @@ class StaticArm:
             loaded = PositionCompensator(model, np.inf, joints=joints)
             loaded.set_payload(1.0, place, model.body(body).name)
             self._loaded = loaded.constants.body
-        self._data = mujoco.MjData(model)
-        if model.nkey:
-            self._data.qpos[:] = model.key_qpos[0]
-        self._at = np.array([model.joint(joint).qposadr[0] for joint in joints])
-        self._dofs = np.array([model.joint(joint).dofadr[0] for joint in joints])
-        self._body = _outermost(model)
-        self._point = np.zeros(3)
-        self._turn = np.eye(3)
-        self.end_effector = model.body(self._body).name or f"body {self._body}"
         if end_effector is not None:
-            self.end_effector = end_effector
-            self._body, self._point = place_of(model, end_effector)
-            self._turn = _turn(model, end_effector)
+            place_of(model, end_effector)  # a name is checked although not all logs need it
+        self._end_effector = end_effector
         self.ranges = np.column_stack(joint_ranges(model, joints))
+
+    @cached_property
+    def end_effector(self) -> str:
+        """Site or body that is measured."""
+        return self._end_effector or outermost_body(self.model)
+
+    @cached_property
+    def _tool(self) -> EndEffector:
+        held = held_positions(self.model, self.joints)
+        return EndEffector(self.model, self.joints, self.end_effector, held)
 
     @property
     def up(self) -> Array:
         """Unit vector against gravity in the world frame, (3,)."""
         return -self.model.opt.gravity / np.linalg.norm(self.model.opt.gravity)
-
-    def require_gravity(self) -> None:
-        """Refuse a model in which nothing bends a joint.
-
-        Raises:
-            ConfigurationError: It has no gravity.
-        """
-        if not self.model.opt.gravity.any():
-            raise ConfigurationError(
-                "the model has no gravity, so nothing bends its joints; set <option gravity=...>"
-            )
 
     def torque(self, q: Array) -> Array:
         """Torque that holds the arm without payload, (N, n) [rad] to (N, n) [N·m]."""
@@ -119,21 +115,7 @@ class StaticArm:
 
     def attitude(self, q: Array) -> Attitude:
         """Poses of the end effector, (N, n) [rad]."""
-        count, n = q.shape
-        found = Attitude(*(np.empty((count, 3, k) if k else (count, 3)) for k in (0, 3, n, n)))
-        jacobians: Any = np.zeros((3, self.model.nv)), np.zeros((3, self.model.nv))
-        for i, row in enumerate(q):
-            self._data.qpos[self._at] = row
-            mujoco.mj_kinematics(self.model, self._data)
-            mujoco.mj_comPos(self.model, self._data)
-            turn = self._data.xmat[self._body].reshape(3, 3)
-            found.rotation[i] = turn @ self._turn
-            found.position[i] = self._data.xpos[self._body] + turn @ self._point
-            mujoco.mj_jac(self.model, self._data, *jacobians, found.position[i], self._body)
-            found.position_gradient[i], found.rotation_gradient[i] = (
-                part[:, self._dofs] for part in jacobians
-            )
-        return found
+        return Attitude(*self._tool.pose(q), *self._tool.jacobian(q))
 
 
 def place_of(model: mujoco.MjModel, name: str) -> tuple[int, Array]:
@@ -147,17 +129,8 @@ def place_of(model: mujoco.MjModel, name: str) -> tuple[int, Array]:
     return int(model.body(name).id), np.zeros(3)
 
 
-def _turn(model: mujoco.MjModel, name: str) -> Array:
-    """Rotation from the frame of a site or body to the frame of its body, (3, 3)."""
-    turn = np.eye(3).ravel()
-    if name in [model.site(i).name for i in range(model.nsite)]:
-        mujoco.mju_quat2Mat(turn, model.site(name).quat)
-    return turn.reshape(3, 3)
-
-
-def _outermost(model: mujoco.MjModel) -> int:
-    """The body with the most bodies between it and the base, the last one of several."""
-    depth = np.zeros(model.nbody, dtype=np.int64)
-    for body in range(1, model.nbody):
-        depth[body] = depth[model.body_parentid[body]] + 1
-    return int(model.nbody - 1 - depth[::-1].argmax())
+def held_positions(model: mujoco.MjModel, joints: Sequence[str]) -> dict[int, float]:
+    """Positions of the other joints by their numbers, as `PositionCompensator` holds them."""
+    home = home_of(model)
+    others = [j for j in range(model.njnt) if model.joint(j).name not in joints]
+    return {j: float(home[model.jnt_qposadr[j]]) for j in others}

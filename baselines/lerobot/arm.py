@@ -259,10 +259,11 @@ class LeRobotArm:
         has_range = np.isfinite(off) & (upper - lower < _TURN_RAD)
         for joint in np.flatnonzero(has_range & (off > _FAR_RAD)):
             place = places[int(joint)]
-            _warn(
+            warnings.warn(
                 f"LeRobot's zero of {self.motors[joint]} is the middle of the calibrated range, and"
                 f" the model's range has its middle at {middle[joint]:.3g} rad: is zero_rad"
-                f" {-place.direction * middle[joint]:.3g} in the place of {place.zero_rad:.3g}?"
+                f" {-place.direction * middle[joint]:.3g} in the place of {place.zero_rad:.3g}?",
+                stacklevel=2,
             )
 
 
@@ -308,7 +309,3 @@ def _without_infinity(content: Any) -> Any:
     if isinstance(content, Mapping):
         return {str(key): _without_infinity(value) for key, value in content.items()}
     return RIGID if content == np.inf else content
-
-
-def _warn(message: str) -> None:
-    warnings.warn(message, stacklevel=3)

@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 
 from baselines.identification.servo_file import read_episodes
-from baselines.identification.servo_log import known_loads
+from baselines.identification.servo_load import Load
+from baselines.identification.servo_log import ServoLog, known_loads
 from baselines.lerobot.arm import LeRobotArm
 from elastic_env.core.config import read_json
 from elastic_env.core.errors import ConfigurationError, list_names, shorten
@@ -22,6 +23,9 @@ _MOST_BYTES = 200_000_000
 """Of a file of rows; LeRobot begins another one at 100 MB."""
 _OLD_PREFIX = "main_"
 """Before the motors' names in data sets of 2024."""
+_FEWEST_ROWS = 3
+"""Rows of an episode that tell an acceleration."""
+_LONGEST_GAP = 1000
 _KINDS = {"so_follower": "so101_follower"}
 """Names of data sets for robots with the same motors."""
 
@@ -43,30 +47,6 @@ class Recording:
     time: Array
     goal: Array
     position: Array
-
-
-@dataclass(frozen=True)
-class JointLog:
-    """A log in time of one joint.
-
-    Attributes:
-        joint: Name in the model.
-        episode: Number of the episode.
-        time: Clock, (N,) [s].
-        goal: Commanded angle of the joint, (N,) [rad].
-        position: Measured one.
-        inertia: Of the links about the joint, mean over the rows [kg·m²].
-        tau_known: Torque of weight and of the other joints' motion, positive where it turns the
-            joint forward, (N,) [N·m].
-    """
-
-    joint: str
-    episode: int
-    time: Array
-    goal: Array
-    position: Array
-    inertia: float
-    tau_known: Array
 
 
 def robot_of(folder: Path) -> str:
@@ -114,12 +94,16 @@ def read_recordings(folder: Path, episodes: Sequence[int] = ()) -> list[Recordin
     return found
 
 
-def joint_logs(recording: Recording, arm: LeRobotArm) -> list[JointLog]:
+def joint_logs(recording: Recording, arm: LeRobotArm) -> list[ServoLog]:
     """Logs of the joints of an arm, in rad, with the torque that its model knows.
 
     Args:
         recording: An episode.
         arm: Units and model; the stiffness of its joints has no effect.
+
+    Returns:
+        A log JOINT_EPISODE for each joint, with the inertia of the links about it, mean over the
+        rows. Known is the torque of weight and of the other joints' motion.
 
     Raises:
         ConfigurationError: The episode lacks a motor of the arm.
@@ -134,23 +118,24 @@ def joint_logs(recording: Recording, arm: LeRobotArm) -> list[JointLog]:
     position = arm.units.angle(recording.position[:, at])
     inertia, known = known_loads(arm.compensator.constants.body, recording.time, position)
     return [
-        JointLog(
-            joint=name,
-            episode=recording.episode,
+        ServoLog(
+            name=f"{name.replace('/', '_')}_{recording.episode}",
             time=recording.time,
             goal=goal[:, joint],
             position=position[:, joint],
-            inertia=float(inertia[joint]),
-            tau_known=known[:, joint],
+            enabled=np.ones(len(goal), dtype=np.bool_),
+            load=Load(inertia=float(inertia[joint])),
+            known=known[:, joint],
         )
         for joint, name in enumerate(arm.compensator.joints)
     ]
 
 
-def log_text(log: JointLog) -> str:
-    """A log as the CSV file that `elastic identify --log` reads."""
-    inertia = np.full_like(log.time, log.inertia)
-    rows = np.column_stack([log.time, log.goal, log.position, inertia, log.tau_known])
+def log_text(log: ServoLog) -> str:
+    """A log of `joint_logs` as the CSV file that `elastic identify --log` reads."""
+    inertia = np.full_like(log.time, log.load.inertia)
+    known = log.external_torque(log.position)
+    rows = np.column_stack([log.time, log.goal, log.position, inertia, known])
     lines = [",".join(f"{value:.9g}" for value in row) for row in rows]
     head = "time [s],goal [rad],position [rad],inertia [kg·m²],tau_known [N·m]"
     return "\n".join([head, *lines, ""])
@@ -186,6 +171,19 @@ def _motors(folder: Path, info: Mapping[str, Any], key: str) -> dict[str, int]:
     return {name: at for at, name in enumerate(plain) if "." not in name}
 
 
+def _require_clock(file: Path, episode: int, time: Array) -> None:
+    """Refuse a clock along which no motion has a speed and an acceleration."""
+    step = np.diff(time)
+    usual = np.median(step) if len(step) else 0.0
+    if len(time) < _FEWEST_ROWS or step.min() <= 0.0 or step.max() > _LONGEST_GAP * usual:
+        apart = f", {step.min():.3g} to {step.max():.3g} s apart" if len(step) else ""
+        raise ConfigurationError(
+            f"{shorten(file)}, episode {episode}: needs at least {_FEWEST_ROWS} rows with a"
+            f" timestamp that grows, without gaps of {_LONGEST_GAP} usual steps, it has"
+            f" {len(time)}{apart}; name the other episodes by --episodes"
+        )
+
+
 def _episodes(
     file: Path,
     motors: Sequence[str],
@@ -205,6 +203,7 @@ def _episodes(
         if wanted and episode not in wanted:
             continue
         rows = table.episode == episode
+        _require_clock(file, episode, table.time[rows])
         yield Recording(
             episode=int(episode),
             motors=tuple(motors),

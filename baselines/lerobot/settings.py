@@ -1,9 +1,7 @@
 """Settings of an arm of LeRobot: which motor moves which joint, its calibration, the model."""
 
-import csv
 import math
 from functools import cache
-from importlib import resources
 from pathlib import Path
 from typing import Any, Literal, Self
 
@@ -12,6 +10,7 @@ from pydantic import model_validator
 from elastic_env.core.config import Model, Title, quantity, read_json
 from elastic_env.core.config_problems import ModelError
 from elastic_env.core.errors import ConfigurationError, require_known, shorten
+from elastic_env.core.files import read_rows
 
 Units = Literal["degrees", "range", "percent"]
 """Degrees, −100 to 100 over the calibrated range, or 0 to 100 over it."""
@@ -127,13 +126,10 @@ class ArmSettings(Model):
 
 
 @cache
-def _known_motors() -> dict[str, tuple[Motor, ...]]:
+def known_motors() -> dict[str, tuple[Motor, ...]]:
     """Motors of the robots of motors.csv, by the robot's type."""
-    file = resources.files("baselines.lerobot") / "motors.csv"
-    lines = file.read_text(encoding="utf-8").splitlines()
-    rows = csv.DictReader(line for line in lines if not line.startswith("#"))
     found: dict[str, tuple[Motor, ...]] = {}
-    for row in rows:
+    for row in read_rows(Path(__file__).with_name("motors.csv")):
         counts = row["counts_per_turn"]
         motor = Motor(
             name=row["motor"],
@@ -143,11 +139,6 @@ def _known_motors() -> dict[str, tuple[Motor, ...]]:
         )
         found[row["robot"]] = (*found.get(row["robot"], ()), motor)
     return found
-
-
-def robot_types() -> list[str]:
-    """Types of robots that are known, as LeRobot names them."""
-    return list(_known_motors())
 
 
 def motors_of(robot: str, use_degrees: bool | None = None) -> tuple[Motor, ...]:
@@ -160,7 +151,7 @@ def motors_of(robot: str, use_degrees: bool | None = None) -> tuple[Motor, ...]:
     Raises:
         ConfigurationError: The type is not known, or its motors know degrees alone.
     """
-    known = _known_motors()
+    known = known_motors()
     require_known("robot of LeRobot", [robot], known)
     motors = known[robot]
     if use_degrees is None:

@@ -27,20 +27,20 @@ def judge_poses(
         return None
     parts = split(len(judged.theta), options.holdout, options.folds, seed)
     if reason := judged.too_few(parts):
-        console.print(f"nothing is held out: {reason}", highlight=False)
+        console.print(f"nothing is held out: {reason}")
         return None
     try:
         work = {"held-out fits": num_fits(judged, parts)}
         with show_progress(console, work, transient=True) as show:
             return judge(judged, parts, seed, partial(show, 0))
     except ElasticError as error:
-        console.print(f"nothing is held out: without some poses {error}", highlight=False)
+        console.print(f"nothing is held out: without some poses {error}")
         return None
 
 
 def show_held_out(held_out: HeldOut, console: Console) -> None:
     """Print the verdict, all errors, and how they fall with the number of poses."""
-    console.print(verdict(held_out), highlight=False)
+    console.print(verdict(held_out))
     rows = []
     for error in held_out.errors:
         figures = (error.rms, error.mean, error.worst)
@@ -52,7 +52,7 @@ def show_held_out(held_out: HeldOut, console: Console) -> None:
         f"{point.poses} poses {_text(point.rms, held_out)} {held_out.unit}"
         for point in held_out.curve
     ]
-    console.print(f"by the number of poses: {', '.join(points)}", highlight=False)
+    console.print(f"by the number of poses: {', '.join(points)}")
 
 
 def verdict(held_out: HeldOut) -> str:

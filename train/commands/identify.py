@@ -11,20 +11,16 @@ from rich.console import Console
 from rich.table import Table
 
 import elastic_env  # noqa: F401  registers the environments
-from baselines.identification.arm_result import ArmIdentification
-from baselines.identification.geometry_result import GeometryIdentification
 from baselines.identification.identify import Identification, identify
-from baselines.identification.servo_result import ServoIdentification
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.robots.testbed.model import Pendulum
-from train.commands.identify_arm import identify_arm
+from train.commands.identify_arm import IdentifiedArm, identify_arm
 from train.commands.identify_options import ArmOptions, IdentificationRun, OfTestbed
 from train.commands.options import OnHardware, given_options
 from train.figures import plots
 from train.figures.identification_plots import draw_identification
 from train.runs.console import make_table
 from train.runs.escaping import write_records
-from train.runs.folders import run_folder
 from train.runs.progress import plain_progress, show_progress
 
 
@@ -50,15 +46,7 @@ class Identify(IdentificationRun):
     on: Annotated[OnHardware, tyro.conf.arg(name="hardware")] = OnHardware()
     arm: ArmOptions = ArmOptions()
 
-    def run(
-        self, console: Console
-    ) -> (
-        list[Identification]
-        | ArmIdentification
-        | GeometryIdentification
-        | ServoIdentification
-        | None
-    ):
+    def run(self, console: Console) -> list[Identification] | IdentifiedArm | None:
         """Identify the testbed, simulated or real, or an arm; write result and figure.
 
         Returns:
@@ -85,9 +73,8 @@ class Identify(IdentificationRun):
         if hardware:
             self._require_real_joint(hardware)
         envs = identified_environments(self)
-        recorded = {**self.testbed.model_dump(mode="json"), "seed": self.seed}
-        recorded |= {"scenario": scenario, "hardware": hardware}
-        with run_folder("identify", recorded, self.seed, self.output) as folder:
+        asked = {**self.testbed.model_dump(mode="json"), "scenario": scenario}
+        with self.folder({**asked, "hardware": hardware}) as folder:
             try:
                 with _progress(hardware, console) as progress:
                     results, points = identify(envs, self.seed, progress)

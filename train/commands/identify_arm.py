@@ -38,22 +38,24 @@ from baselines.identification.pose_plan import (
     plan_further,
     plan_poses,
 )
+from baselines.identification.servo_file import is_servo_log
 from baselines.identification.servo_result import ServoIdentification
 from baselines.identification.static_arm import StaticArm
 from elastic_env.core.errors import ConfigurationError, quote, unknown_name
 from elastic_env.joint.model_file import compiled_model, from_mujoco
 from elastic_env.joint.supported_models import commanded_hinges, hinges_of
+from elastic_env.world.robot_model import joint_ranges
 from train.commands.held_out import judge_poses, number_or_dash, show_held_out
 from train.commands.identify_geometry import identify_geometry
 from train.commands.identify_options import ArmOptions, IdentificationRun, ServoOptions
-from train.commands.identify_servo import are_servo_logs, identify_servo
+from train.commands.identify_servo import identify_servo
 from train.commands.options import given_options
 from train.figures import plots
 from train.figures.identification_plots import draw_arm_identification
 from train.runs.console import make_table
-from train.runs.folders import run_folder
 from train.runs.progress import show_progress
 
+IdentifiedArm = ArmIdentification | GeometryIdentification | ServoIdentification
 _ASSUMED_DEFLECTION_RAD = 0.01
 """Deflection under the largest gravity torque that a plan without a log assumes."""
 
@@ -82,7 +84,7 @@ class _Setting:
 
 def identify_arm(
     options: ArmOptions, run: IdentificationRun, console: Console
-) -> ArmIdentification | GeometryIdentification | ServoIdentification | None:
+) -> IdentifiedArm | None:
     """Identify an arm or a servo, write files and print the result; or plan poses.
 
     Args:
@@ -97,17 +99,20 @@ def identify_arm(
         ConfigurationError: Model, log or a name cannot be used.
         ResultsExistError: The output folder holds results.
     """
-    if are_servo_logs(options.log):
+    if options.log and is_servo_log(Path(options.log[0])):
         return identify_servo(options, run, console)
     _require_poses(options)
     plots.require_matplotlib()
     setting = _setting(options, compiled_model(str(options.robot)), console, run.seed)
     if setting.seeks_geometry:
-        _require_no_plan(options, setting.log)
+        _require_positions(options, setting.log)
         tool = setting.arm.end_effector
         return identify_geometry(options, setting.log, setting.elastic, tool, run, console)
-    recorded = {**options.model_dump(mode="json"), "seed": run.seed}
-    with run_folder("identify", recorded, run.seed, run.output) as folder:
+    if of_geometry := given_options(options.markers, ["lateral", "free"]):
+        raise ConfigurationError(
+            f"{', '.join(of_geometry)}: for a fit of the geometry only; ask for one by --geometry"
+        )
+    with run.folder(options.model_dump(mode="json")) as folder:
         if not options.log:
             _plan_first(setting, folder, console)
             return None
@@ -275,30 +280,36 @@ def shaped_model(path: str) -> mujoco.MjModel:
     return shaped if set(hinges_of(plain)) <= set(hinges_of(shaped)) else plain
 
 
-def _require_no_plan(options: ArmOptions, log: PoseLog) -> None:
-    """Refuse options that a fit of the geometry has no use for.
+def _require_positions(options: ArmOptions, log: PoseLog) -> None:
+    """Refuse measurements and options that a fit of the geometry has no use for.
 
     Raises:
-        ConfigurationError: One of them is given.
+        ConfigurationError: The log has no positions, or one of the options is given.
     """
     of_site = ["end_effector"] if log.kind == "markers" else []
-    if unused := given_options(options, ["plan", "payload", "assume", *of_site]):
+    of_poses = ["plan", "payload", "assume", "frame", "within", *of_site]
+    if unused := given_options(options, of_poses):
         raise ConfigurationError(
             f"{', '.join(unused)} {'is' if len(unused) == 1 else 'are'} not for a fit of the"
             " geometry from markers; leave it out"
+        )
+    if log.kind not in ("markers", "end_effector"):
+        raise ConfigurationError(
+            "a fit of the geometry needs positions, in columns marker.NAME.x, .y, .z or"
+            f" end_effector.x, .y, .z, and {options.log[0]} is used for its"
+            f" {log.kind.replace('_', ' ')}; leave --geometry out"
         )
 
 
 def _setting(options: ArmOptions, model: mujoco.MjModel, console: Console, seed: int) -> _Setting:
     """Read the log, and look everything up that is named."""
     hinges = hinges_of(model)
-    ranges = {name: _range(model, name) for name in hinges}
     log = None
     if options.log:
+        ranges = dict(zip(hinges, zip(*joint_ranges(model, hinges), strict=True), strict=True))
         log = read_log(Path(options.log[0]), ranges, options.measured_by)
     joints = commanded_hinges(model) if log is None else log.joints
     arm = StaticArm(model, joints, options.end_effector, options.payload)
-    arm.require_gravity()
     if log is None:
         log = empty_log(arm, options.measured_by or "end_effector")
     if options.end_effector is None and log.kind in ("end_effector", "imu"):
@@ -311,12 +322,6 @@ def _setting(options: ArmOptions, model: mujoco.MjModel, console: Console, seed:
     if options.log and not setting.seeks_geometry:
         require_poses(setting.model(log))
     return setting
-
-
-def _range(model: mujoco.MjModel, joint: str) -> tuple[float, float]:
-    hinge = model.joint(joint)
-    low, high = hinge.range if model.jnt_limited[hinge.id] else (-np.inf, np.inf)
-    return float(low), float(high)
 
 
 def _elastic_joints(patterns: Sequence[str], joints: Sequence[str]) -> tuple[str, ...]:

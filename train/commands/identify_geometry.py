@@ -7,7 +7,7 @@ import numpy as np
 from rich import box
 from rich.console import Console
 
-from baselines.identification.geometry_fit import GeometryProblem, align_tracker, fit_geometry
+from baselines.identification.geometry_fit import GeometryProblem, fit_geometry
 from baselines.identification.geometry_model import AxialTorques, GeometryModel
 from baselines.identification.geometry_result import (
     GeometryIdentification,
@@ -16,7 +16,7 @@ from baselines.identification.geometry_result import (
 )
 from baselines.identification.holdout import Judged
 from baselines.identification.pose_log import PoseLog
-from baselines.identification.static_arm import place_of
+from baselines.identification.static_arm import held_positions, place_of
 from elastic_env.core.errors import list_names, unknown_name
 from elastic_env.joint.model_file import read_model
 from elastic_env.rigid.tree.links import Tree
@@ -24,7 +24,6 @@ from train.commands.held_out import judge_poses, number_or_dash, show_held_out
 from train.commands.identify_options import ArmOptions, GeometryOptions, IdentificationRun
 from train.figures.identification_plots import draw_geometry
 from train.runs.console import make_table
-from train.runs.folders import run_folder
 from train.runs.progress import show_progress
 
 
@@ -52,9 +51,7 @@ def identify_geometry(
     """
     spec = read_model(str(options.robot)).spec
     problem, tree = pose_problem(options.markers, spec.compile(), log, elastic, end_effector)
-    recorded = options.markers.model_dump(mode="json") | options.judged.model_dump()
-    recorded["seed"] = run.seed
-    with run_folder("identify", recorded, run.seed, run.output) as folder:
+    with run.folder(options.model_dump(mode="json")) as folder:
         with show_progress(console, {"fits": 1}, transient=True) as show:
             fit = fit_geometry(problem)
             show(0, 1)
@@ -64,7 +61,7 @@ def identify_geometry(
         files.append(draw_geometry(result, folder / f"identification.{run.figure_format}"))
     show_result(result, console)
     for path in files:
-        console.print(f"wrote {path}", soft_wrap=True)
+        console.print(f"wrote {path}")
     return result
 
 
@@ -79,20 +76,14 @@ def pose_problem(
     for joint in options.free:
         if joint not in log.joints:
             raise unknown_name("joint of the log", joint, log.joints)
-    joints = [model.joint(number) for number in range(model.njnt)]
-    others = [joint for joint in joints if joint.name not in log.joints]
-    held = {joint.name: float(joint.qpos0[0]) for joint in others}
-    tree = Tree.of(model, log.joints, held)
+    tree = Tree.of(model, log.joints, held_positions(model, log.joints))
     names = [end_effector]
     if log.kind == "markers":
         names = [column.removesuffix(".x") for column in log.columns[::3]]
     markers = [(name, *place_of(model, name)) for name in names]
     measured = log.measured.reshape(len(log), len(names), 3)
-    geometry = align_tracker(
-        GeometryModel.of(tree, log.joints, model.opt.gravity, markers), log.theta, measured
-    )
     problem = GeometryProblem(
-        model=geometry,
+        model=GeometryModel.of(tree, log.joints, model.opt.gravity, markers),
         theta=log.theta,
         measured=measured,
         joints=log.joints,
@@ -103,7 +94,7 @@ def pose_problem(
         free=options.free,
         axial=_axial(log),
     )
-    return problem, tree
+    return problem.align(), tree
 
 
 def _axial(log: PoseLog) -> AxialTorques | None:
@@ -144,6 +135,5 @@ def show_result(result: GeometryIdentification, console: Console) -> None:
     if unseen:
         console.print(
             f"{len(unseen)} of {len(result.parameters)} parameters keep their prior, as the"
-            f" poses do not tell them: {list_names(unseen)}",
-            highlight=False,
+            f" poses do not tell them: {list_names(unseen)}"
         )

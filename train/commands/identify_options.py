@@ -1,7 +1,8 @@
 """Options of `elastic identify`: of the run, and of testbed, arm, geometry and servo."""
 
+from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Annotated, Self
+from typing import Annotated, Any, Self
 
 import tyro
 from pydantic import model_validator
@@ -15,6 +16,7 @@ from baselines.identification.servo_file import AngleUnit
 from elastic_env.core.config import LARGEST_SEED, Locator, Model, Title, quantity
 from elastic_env.joint.joint_settings import SOFTEST
 from train.figures.plots import FigureFormat
+from train.runs.folders import run_folder
 
 _STIFFEST = 1e9
 """Largest K that can be assumed; a stiffer joint is rigid [N·m/rad]."""
@@ -29,6 +31,10 @@ class IdentificationRun(Model):
     """Folder for the results, new or empty; default runs/identify, numbered if taken."""
     figure_format: FigureFormat = "png"
     """Of the figures: pdf and svg have no resolution, and png has 300 dpi."""
+
+    def folder(self, asked: dict[str, Any]) -> AbstractContextManager[Path]:
+        """A new folder for results, with what was asked for."""
+        return run_folder("identify", {**asked, "seed": self.seed}, self.seed, self.output)
 
 
 class OfTestbed(Model):

@@ -9,7 +9,6 @@ from pathlib import Path
 from rich import box
 from rich.console import Console
 
-from baselines.identification.servo_file import is_servo_log
 from baselines.identification.servo_fit import STAGES, fit_servo
 from baselines.identification.servo_holdout import ServoHoldout, judge_servo, split_logs
 from baselines.identification.servo_load import Load
@@ -28,13 +27,7 @@ from train.commands.options import given_options
 from train.figures import plots
 from train.figures.identification_plots import draw_servo
 from train.runs.console import make_table
-from train.runs.folders import run_folder
 from train.runs.progress import show_progress
-
-
-def are_servo_logs(paths: Sequence[str]) -> bool:
-    """True if the first of some files is a log in time."""
-    return bool(paths) and is_servo_log(Path(paths[0]))
 
 
 def identify_servo(
@@ -63,14 +56,13 @@ def identify_servo(
 
     logs = list(map(read, paths))
     further = list(map(read, servo.unfitted))
-    _require_alike("supply voltage", [log.supply for log in (*logs, *further)])
-    _require_alike("gain", [log.gain for log in (*logs, *further) if log.enabled.any()])
+    _require_alike("supply voltage", [log.supply == 1.0 for log in (*logs, *further)])
+    _require_alike("gain", [log.gain is None for log in (*logs, *further) if log.enabled.any()])
     inner = logs
     outer = further
     if not further and options.judged.holdout:
         inner, outer = split_logs(logs, options.judged.holdout, run.seed)
-    recorded = {**servo.model_dump(mode="json"), "log": paths, "seed": run.seed}
-    with run_folder("identify", recorded, run.seed, run.output) as folder:
+    with run.folder(options.model_dump(mode="json")) as folder:
         fits = 1 if inner is logs else 2
         with show_progress(console, {"fits, stages": fits * STAGES}, transient=True) as show:
             fit = fit_servo(inner, partial(show, 0), run.seed)
@@ -85,7 +77,7 @@ def identify_servo(
         files.append(draw_servo(shown, played, picture, is_held_out=bool(outer)))
     show_result(result, console)
     for path in files:
-        console.print(f"wrote {path}", soft_wrap=True)
+        console.print(f"wrote {path}")
     return result
 
 
@@ -131,7 +123,7 @@ def known_load(options: ServoOptions, robot: str | None, joint: str | None) -> L
 def show_result(result: ServoIdentification, console: Console) -> None:
     """Print held-out errors, parameters, and what the logs do not tell."""
     if result.held_out is not None:
-        console.print(verdict(result.held_out), highlight=False)
+        console.print(verdict(result.held_out))
         rows = [
             [error.name, f"{error.rms_mrad:.1f}", number_or_dash(error.slow_mrad, ".1f")]
             for error in result.held_out.errors
@@ -163,7 +155,7 @@ def show_result(result: ServoIdentification, console: Console) -> None:
     console.print(make_table(title, head, rows, box=box.SIMPLE))
     console.print("the logs do not tell:")
     for line in result.untold:
-        console.print(f"  {line}", highlight=False)
+        console.print(f"  {line}")
 
 
 def verdict(held_out: ServoHoldout) -> str:
@@ -206,7 +198,7 @@ def fitted_logs(paths: Sequence[str], unfitted: Sequence[str], console: Console)
             f"--unfitted names all logs of --log, {', '.join(left_out)}: leave one to fit"
         )
     if left_out:
-        console.print(f"not fitted, as --unfitted says: {', '.join(left_out)}", highlight=False)
+        console.print(f"not fitted, as --unfitted says: {', '.join(left_out)}")
     return [path for path in paths if path not in left_out]
 
 
@@ -231,9 +223,9 @@ def _each_once(paths: Sequence[str]) -> dict[str, set[Path | str]]:
     return seen
 
 
-def _require_alike(what: str, values: Sequence[float]) -> None:
-    """Refuse logs of which only some say a value; it is 1 where they do not."""
-    if len({value == 1.0 for value in values}) > 1:
+def _require_alike(what: str, lacks: Sequence[bool]) -> None:
+    """Refuse logs of which only some say a value."""
+    if len(set(lacks)) > 1:
         raise ConfigurationError(
             f"some logs say their {what} and some do not; give it in all or in none"
         )

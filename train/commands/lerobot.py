@@ -61,8 +61,8 @@ class Lerobot(Model):
         with run_folder("lerobot", self.model_dump(mode="json"), None, self.output) as folder:
             for recording in recordings:
                 for log in joint_logs(recording, arm):
-                    write_whole(folder / f"{log.joint}_{log.episode}.csv", log_text(log))
+                    write_whole(folder / f"{log.name}.csv", log_text(log))
             rows = sum(len(recording.time) for recording in recordings)
             joints = arm.compensator.joints
             console.print(f"{rows} rows in {len(recordings)} recordings of {', '.join(joints)}")
-            console.print(f"elastic identify --log {folder}/{joints[-1]}_*.csv")
+            console.print(f"elastic identify --log {folder}/{joints[-1].replace('/', '_')}_*.csv")

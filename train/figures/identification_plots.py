@@ -245,7 +245,7 @@ def draw_servo(
         axis.plot(log.time, log.position, color=_MEASURED, lw=1.6, label="measured")
         axis.plot(log.time, q, color=_REPLAYED, lw=1.2, label="replayed")
         rms = MRAD * float(np.sqrt(np.mean((q - log.position) ** 2)))
-        gain = "" if log.gain == 1.0 else f", gain {log.gain:g}"
+        gain = "" if log.gain is None else f", gain {log.gain:g}"
         axis.set_title(label_text(f"{log.name}{gain}: {rms:.1f} mrad rms"), fontsize=9)
     for axis in axes[len(shown) :]:
         axis.set_visible(False)
