@@ -701,6 +701,9 @@ def test_several_configurations_are_trained_in_one_pool(
     said = capsys.readouterr().out
     assert "both/a is complete" in said
     assert "both/b is complete" in said
+    shutil.copytree("both/a", "again/a")
+    main(["train", "--resume", "both/a", "again/a"])
+    assert "again/a is complete" in capsys.readouterr().out
 
 
 def test_a_training_seed_that_another_program_trains_is_left_alone(

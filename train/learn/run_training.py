@@ -122,7 +122,7 @@ def _train(runs: Sequence[Run], console: Console, executors: Executors) -> None:
     calls = [(run, seed) for run in runs for seed in run.config.seeds]
     names = [f"seed {seed}" for _, seed in calls]
     if len(runs) > 1:
-        names = [f"{run.folder.name}, seed {seed}" for run, seed in calls]
+        names = [f"{run.folder}, seed {seed}" for run, seed in calls]
     decisions = [run.config.decisions for run, _ in calls]
     totals = dict(zip(names, decisions, strict=True))
     with show_progress(console, totals, unit="decisions") as show:
