@@ -5,11 +5,11 @@ import json
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Annotated, Any, Literal, get_args
 
 from rich.console import Console
 
-from elastic_env.core.config import LARGEST_SEED, Entries, Locator, Model, Title, quantity
+from elastic_env.core.config import LARGEST_SEED, Entries, Locator, Model, Once, Title, quantity
 from elastic_env.core.files import write_whole
 from train.commands.compare import try_out
 from train.commands.options import MotionOrDefault
@@ -45,7 +45,12 @@ class Margins(Model):
     Example, one policy: elastic margins --policies input_output --robots 4 --quantities push_n
     """
 
-    policies: Entries[Locator] = ["input_output", "adaptive_posture", "foothold", "thormang"]
+    policies: Annotated[Entries[Locator], Once] = [
+        "input_output",
+        "adaptive_posture",
+        "foothold",
+        "thormang",
+    ]
     """Baselines, residual:PATH, "FILE.py:function" or "module:function"."""
     quantities: Entries[Field] = list(get_args(Field))
     """Fields of the scenario that are varied, one at a time."""

@@ -137,15 +137,19 @@ def _film(env: Any, episode: Iterable[_Step], period: float, video: Path) -> Non
         writer: Any = imageio.get_writer(memory, "gif", duration=1e3 * frame_s)
     else:
         writer = imageio.get_writer(video, fps=1.0 / frame_s)
-    with writer:
-        for step, _ in episode:
-            if step % every == 0:
-                writer.append_data(env.render())
-                frames += 1
-    if is_gif:
-        video.write_bytes(memory.getbuffer())
-    else:
-        _require_whole(video, frames)
+    try:
+        with writer:
+            for step, _ in episode:
+                if step % every == 0:
+                    writer.append_data(env.render())
+                    frames += 1
+        if is_gif:
+            video.write_bytes(memory.getbuffer())
+        else:
+            _require_whole(video, frames)
+    except BaseException:
+        video.unlink(missing_ok=True)  # what is not whole would stand in the way of the next one
+        raise
 
 
 def _require_whole(video: Path, frames: int) -> None:
