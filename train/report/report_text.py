@@ -167,7 +167,7 @@ def _scores(rows: pd.DataFrame, column: Column) -> Scores:
     """Mean of every policy over training seeds and cells [SI], and failures."""
     found = {}
     for title, own in rows.groupby("policy", sort=False):
-        means = own.groupby(["member", "cell"])[column.metric].mean()
+        means: Any = own.groupby(["member", "cell"])[column.metric].mean()
         found[str(title)] = Estimate(float(means.mean())), failures(own)
     return found
 
