@@ -96,9 +96,7 @@ class Margins(Model):
                     before = itertools.count(0, steps[number])
                     play = partial(self._play, before, partial(show, number))
                     records += find_margins(condition, chosen, self.robots, self.halvings, play)
-                    rows = [{**own} for own in records]
-                    for row in rows:
-                        del row["edges"]
+                    rows = [{k: v for k, v in own.items() if k != "edges"} for own in records]
                     write_records(rows, files[0])
                     write_whole(files[1], json.dumps(records, indent=2) + "\n")
         title = f"worst / median edge of {self.robots} robots, {conditions[0].reference_name}"
