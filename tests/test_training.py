@@ -579,6 +579,13 @@ def test_training_seeds_and_evaluation_seeds_are_disjoint(
     assert evaluated + 1_000 < min(trained)
 
 
+@pytest.mark.parametrize("key", ["env_options", "training_options"])
+def test_options_of_an_environment_are_refused_by_the_key_they_stand_in(key: str) -> None:
+    """Catches an argument that is found late, and one of trainings named as of all worlds."""
+    with pytest.raises(ConfigurationError, match=rf"^{key}: scenario cannot be given here"):
+        TrainConfig(**{key: {"scenario": "ideal"}})
+
+
 def test_residuals_learn_from_other_robots_than_they_are_evaluated_with() -> None:
     """Catches a score on robots that training has seen."""
     config = TrainConfig(env="walker", scenarios=["spread"], worlds=2)

@@ -23,6 +23,7 @@ from train.commands.options import OnHardware, name_options
 from train.evaluate.changes import changes, merge_seeds
 from train.evaluate.conditions import (
     Condition,
+    EnvOptions,
     GivenRanges,
     GivenReference,
     NumEpisodes,
@@ -98,7 +99,7 @@ class CompareConfig(CodeNamingModel):
     """Seed of the first episode."""
     ranges: GivenRanges = {}
     """Intervals that the robots of the scenario `drawn` are drawn from, in place of its own."""
-    env_options: dict[str, Any] = {}
+    env_options: EnvOptions = {}
     """Further arguments of the environment, such as stiffness."""
     figure_policies: list[str] = []
     """Policies that the time series show, by label or name; all if empty."""
