@@ -15,16 +15,18 @@ from elastic_env.core.config import Model
 from train.cells.play import run_conditions
 from train.commands.compare import CompareConfig
 from train.evaluate.conditions import PolicySpec
-from train.evaluate.episodes import Evaluation
+from train.evaluate.episodes import Evaluation, group_by
 from train.evaluate.rollout import make_vector_env
 from train.figures import comparison_figures, plots
+from train.figures.chart import time_chart
 from train.figures.colours import policy_colours
 from train.figures.identification_plots import draw_identification
 from train.report import summary
 from train.report.page import TEXTS, Page
 from train.report.report_text import capital
+from train.report.specs import page_chart
 from train.report.table_formats import Table
-from train.report.write import add_cell_curves, require_libraries, write_page
+from train.report.write import require_libraries, write_page
 from train.runs.console import make_table, print_files
 from train.runs.folders import run_folder
 
@@ -152,8 +154,11 @@ def _add_cells(page: Page, evaluations: Cells) -> None:
     known = evaluations[0].condition.environment
     page.add("table", summary.summary_table(evaluations, known.columns))
     for own in comparison_figures.cells_together(evaluations):
-        colours = policy_colours([e.condition.policy.title for e in own])
-        add_cell_curves(page, own, colours, _POINTS)
+        first = own[0].condition
+        policies = group_by(own, lambda e: e.condition.policy.title)
+        chart = time_chart(policies, known.curves, policy_colours(list(policies)), _POINTS)
+        title = capital(f"{known.title(first.reference_name)}, {first.scenario}")
+        page.add("chart", page_chart(chart), title)
 
 
 _POINTS = 1500

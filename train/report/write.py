@@ -10,7 +10,7 @@ from train.evaluate.environments import Column
 from train.evaluate.episodes import Evaluation, group_by
 from train.evaluate.statistics import Estimate
 from train.evaluate.table import EpisodeTable, score
-from train.figures.chart import Colours, learning_chart, time_chart
+from train.figures.chart import learning_chart, time_chart
 from train.figures.comparison_figures import cells_together, sweep_charts
 from train.figures.map_plots import panels
 from train.report.change_tables import changes_table
@@ -169,27 +169,11 @@ def _add_curves(page: Page, results: Results) -> None:
     shared = _ALL_POINTS // (len(table.references) * len(table.scenarios))
     most = min(_POINTS, max(_LEAST_POINTS, shared))
     for number, own in enumerate(cells_together(traced)):
-        add_cell_curves(page, own, results.colours, most, is_folded=True, is_open=number == 0)
-
-
-def add_cell_curves(
-    page: Page, cell: Sequence[Evaluation], colours: Colours, most_points: int, **folding: bool
-) -> None:
-    """Add the curves over time of one motion and scenario to a page.
-
-    Args:
-        page: The page.
-        cell: First episodes of the policies.
-        colours: Of the policies.
-        most_points: Points of a curve, about.
-        **folding: As of `Part`.
-    """
-    first = cell[0].condition
-    known = first.environment
-    policies = group_by(cell, lambda e: e.condition.policy.title)
-    chart = time_chart(policies, known.curves, colours, most_points)
-    title = capital(f"{known.title(first.reference_name)}, {first.scenario}")
-    page.add("chart", page_chart(chart), title, **folding)
+        first = own[0].condition
+        policies = group_by(own, lambda e: e.condition.policy.title)
+        chart = time_chart(policies, known.curves, results.colours, most)
+        title = capital(f"{known.title(first.reference_name)}, {first.scenario}")
+        page.add("chart", page_chart(chart), title, is_folded=True, is_open=number == 0)
 
 
 def _add_sweeps(page: Page, results: Results) -> None:
