@@ -183,7 +183,9 @@ BROKEN = (
     BrokenFormula(_PLAN, "samples[2:] - 2.0 * samples[1:-1]", "samples[2:] - samples[1:-1]", PLAN),
     BrokenFormula(_STATISTICS, "np.mean(mine, axis=-1)", "np.median(mine, axis=-1)", STATISTICS),
     BrokenFormula(_STATISTICS, "0.5 * (mine == base)", "(mine == base)", STATISTICS),
-    BrokenFormula(_STATISTICS, "[::-1] / counted", "/ counted", STATISTICS),
+    BrokenFormula(
+        _STATISTICS, "n - np.maximum(WORST * n, 1.0), n", "0.0 * n, WORST * n", STATISTICS
+    ),
 )
 
 

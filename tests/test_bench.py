@@ -145,6 +145,22 @@ def test_an_update_fits_without_margin_and_changes_figures_alone(
     assert "figures of cases.1 stand elsewhere" in capsys.readouterr().err
 
 
+def test_an_update_refuses_figures_that_two_cases_share(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """Catches figures of one case that take the place of another one's, which then falls
+    short."""
+    path = written()
+    case = "{env: testbed, policy: zero, reference: sine, figures: *a}"
+    path.write_text(path.read_text().replace("figures:", "figures: &a") + f"- {case}\n")
+    before = path.read_bytes()
+    with pytest.raises(SystemExit) as end:
+        main(["bench", str(path), "--update"])
+    assert end.value.code == 2
+    assert "figures of cases.1 stand elsewhere" in capsys.readouterr().err
+    assert path.read_bytes() == before
+
+
 def test_wrong_inputs_are_annotations_too(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

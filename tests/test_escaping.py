@@ -29,7 +29,7 @@ from train.report.table_formats import to_markdown
 from train.runs.console import PlainConsole, traceback_of, visible_warnings
 from train.runs.escaping import (
     chart_text,
-    csv_row,
+    csv_cell,
     markdown_text,
     script_json,
     visible,
@@ -271,8 +271,8 @@ def test_a_markdown_table_keeps_its_cells(first: str, second: str) -> None:
 def test_no_cell_of_a_csv_file_is_a_formula(row: list[object]) -> None:
     """Catches text that a spreadsheet runs, and numbers that become text."""
     file = io.StringIO()
-    csv.writer(file).writerow(csv_row(row))
-    for value, cell in zip(row, csv_row(row), strict=True):
+    csv.writer(file).writerow(map(csv_cell, row))
+    for value, cell in zip(row, map(csv_cell, row), strict=True):
         if isinstance(value, str):
             is_number = re.fullmatch(r"[-+]?[\d.]+", cell) is not None
             assert is_number or not cell.startswith(("=", "+", "-", "@", "\t", "\r"))

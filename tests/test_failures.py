@@ -351,6 +351,7 @@ def test_a_film_that_does_not_fit_is_one_sentence(video: str, said: str, tmp_pat
     assert run.returncode == 3, run.stderr
     assert said in run.stderr
     assert "Traceback" not in run.stderr
+    assert not (tmp_path / video).exists()
 
 
 @pytest.mark.parametrize(

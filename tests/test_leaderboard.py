@@ -487,6 +487,14 @@ def test_a_policy_of_ones_own_stands_beside_published_ones_that_do_not_play(
     assert len(played) == 2  # all of it was found before anything played
 
 
+def test_a_table_that_is_none_is_refused_in_a_sentence(tmp_path: Path) -> None:
+    """Catches a cell longer than the reader of CSV takes, which is no `ValueError`."""
+    path = tmp_path / "leaderboard.csv"
+    path.write_text(f"track\n{'a' * 200_000}\n")
+    with pytest.raises(ConfigurationError, match=r"is no leaderboard\.csv: .*field limit"):
+        read_leaderboard(path)
+
+
 def test_the_package_brings_a_leaderboard_of_its_version_and_preset() -> None:
     """Catches a file that is not in the package, and one that nobody can append to."""
     preset = load_yaml(ROOT / "configs" / "leaderboard.yaml", CompareConfig)

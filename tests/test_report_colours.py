@@ -19,6 +19,7 @@ from train.figures.colours import (
     SHADE,
     STRONG,
     VERDICTS,
+    policy_colours,
 )
 from train.report.report_text import Results
 from train.report.write import write_report
@@ -34,6 +35,13 @@ def luminance(colour: str) -> float:
     channels = [int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5)]
     linear = [c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in channels]
     return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
+
+
+def test_a_policy_has_its_colour_however_often_others_are_named() -> None:
+    """Catches cells of a sweep that are counted as policies: two would share a colour."""
+    colours = policy_colours(["mine", "yours"])
+    assert policy_colours([*["mine"] * len(STRONG), "yours"]) == colours
+    assert colours["mine"] != colours["yours"]
 
 
 def contrast(one: str, other: str) -> float:

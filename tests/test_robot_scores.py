@@ -14,6 +14,7 @@ from rich.console import Console
 from scipy import stats
 
 from elastic_env.core.errors import ConfigurationError
+from elastic_env.core.signals import Array
 from elastic_env.robots.thormang.config import robot_bank
 from elastic_env.world.scenario import TRAINING_RANGES, make_scenario
 from tests.cells import METRIC, cell, episode_rows, family, records
@@ -24,7 +25,7 @@ from train.evaluate.episodes import evaluate
 from train.evaluate.residual_seeds import Origin
 from train.evaluate.robots import robot_scores, share_better
 from train.evaluate.rollout import make_vector_env
-from train.evaluate.statistics import interquartile_mean, worst_share_mean
+from train.evaluate.statistics import interquartile_mean, mean_of_part, worst_share
 from train.learn.train_config import TrainConfig, training_worlds
 from train.report.report_text import Results
 from train.report.score_tables import print_robots, robots_table, write_robots
@@ -41,6 +42,11 @@ def _folders_of_residuals_elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
 
 # Figures.
+
+
+def worst_share_mean(values: Array) -> float:
+    """The statistic of a sample in which every robot is once."""
+    return mean_of_part(worst_share)(values[None], np.ones((1, len(values)))).item()
 
 
 def test_the_worst_tenth_of_known_numbers() -> None:

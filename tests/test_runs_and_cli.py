@@ -42,6 +42,7 @@ from train.commands.compare import CompareConfig
 from train.commands.play import play
 from train.evaluate.conditions import Condition, PolicySpec
 from train.evaluate.episodes import Evaluation, evaluate
+from train.evaluate.rollout import PolicyFailedError
 from train.runs.console import shown_warnings, warn_once
 from train.runs.folders import free_folder, run_folder
 from train.runs.progress import show_progress
@@ -655,6 +656,7 @@ COMMANDS: dict[str, tuple[list[str], list[str]]] = {
     ),
     "episodes": (["evaluate", "--episodes", "0"], ["error: --episodes must be", ">= 1"]),
     "seed": (["evaluate", "--seed", "-1"], ["error: --seed must be", ">= 0", "-1"]),
+    "scenario of no name": (["evaluate", "--scenario", ""], ["unknown scenario ''", "nominal"]),
     "both": (
         ["evaluate", "--seed", "-1", "--episodes", "0"],
         ["--episodes must be", "\n--seed must be"],
@@ -702,6 +704,10 @@ COMMANDS: dict[str, tuple[list[str], list[str]]] = {
         ["'inptu'", "input", "oracle"],
     ),
     "margins policy": (["margins", "--policies", "inptu"], ["'inptu'", "input_output", "foothold"]),
+    "margins twice": (
+        ["margins", "--policies", "zero", "zero"],
+        ["error: --policies: 'zero' stands twice"],
+    ),
     "margins ranges": (["margins", "--scenario", "drawn"], ["ranges", "push_n"]),
     "margins robots": (["margins", "--robots", "65"], ["--robots must be", "<= 64", "65"]),
     "speed rounds": (
@@ -910,14 +916,18 @@ def test_speed_measures_and_writes_every_contender(capsys: pytest.CaptureFixture
 
 
 @pytest.mark.slow
-def test_speed_of_learning_end_to_end(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches a PPO that collects in one place and is timed in another."""
+@pytest.mark.parametrize("policy", ["input", "mine.py:make"])
+def test_speed_of_learning_end_to_end(policy: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a PPO that collects in one place and is timed in another, and one that knows no
+    policy of the user's."""
+    own = "import baselines\n\n\ndef make(env):\n    return baselines.make('zero', env)\n"
+    Path("mine.py").write_text(own)
     monkeypatch.setattr(train.speed.contenders, "PPO_DECISIONS", 32)
-    main([*SPEED, "--env", "testbed", "--num-envs", "2", "--no-others"])
+    main([*SPEED, "--env", "testbed", "--num-envs", "2", "--no-others", "--policy", policy])
     ours, processes = json.loads(Path("runs/speed/speed.json").read_text())[-2:]
-    assert (ours["contender"], ours["num_envs"]) == ("PPO with input, vector env", 64)
-    assert processes["contender"] == "PPO with input, SubprocVecEnv(2)"
-    assert processes["against"] == "PPO with input, vector env, 64"
+    assert (ours["contender"], ours["num_envs"]) == (f"PPO with {policy}, vector env", 64)
+    assert processes["contender"] == f"PPO with {policy}, SubprocVecEnv(2)"
+    assert processes["against"] == f"PPO with {policy}, vector env, 64"
     assert 0.0 < processes["ratio"] < 1.0
 
 
@@ -985,6 +995,18 @@ def test_play_takes_one_step_at_least_and_the_episode_at_most(
     monkeypatch.setattr("train.commands.play._film", film)
     play(condition(), Console(quiet=True), Path("x.gif"), max_s=max_s)
     assert played == [steps, steps]
+
+
+@pytest.mark.parametrize("video", ["x.mp4", "x.gif"])
+def test_play_leaves_no_film_of_an_episode_that_failed(video: str) -> None:
+    """Catches the first half of a film, which stands in the way of the next one."""
+    own = "class Mine:\n    def __init__(self, env):\n        self.steps = 0\n\n"
+    own += "    def predict(self, *_, **__):\n        self.steps += 1\n"
+    own += "        return [0.0 / (self.steps < 30)], None\n"
+    Path("mine.py").write_text(own)
+    with pytest.raises(PolicyFailedError, match=r"at control step 29 .* ZeroDivisionError"):
+        play(condition("mine.py:Mine"), Console(quiet=True), Path(video))
+    assert not Path(video).exists()
 
 
 def test_play_films_a_time_shorter_than_a_control_step() -> None:

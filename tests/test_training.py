@@ -29,6 +29,7 @@ from baselines.residual_env import ResidualVectorWrapper
 from elastic_env.core.errors import ConfigurationError, ElasticError
 from elastic_env.core.signals import Array
 from elastic_env.robots.thormang.config import BANK_SIZE
+from elastic_env.world.envs import ElasticVectorEnv
 from train.commands.bench import BenchCase
 from train.commands.cli import main
 from train.evaluate.episodes import evaluate
@@ -40,7 +41,7 @@ from train.learn.run_training import _change as change_in_words
 from train.learn.run_training import resume
 from train.learn.sb3_env import SB3VecEnv
 from train.learn.train_config import TrainConfig, training_worlds
-from train.learn.trainer import play_together
+from train.learn.trainer import play_scenarios
 from train.learn.training import Curves, Training
 from train.runs.folders import lock_run
 from train.workers.executors import Executors
@@ -346,11 +347,10 @@ def test_before_its_first_decision_a_residual_is_scored_as_what_it_is(tmp_path: 
     (row,) = read_progress(tmp_path)
     assert row["decisions"] == 0
     metric = "link_error_rms_rad"
-    begun = config.condition("nominal", f"residual:{tmp_path / 'best'}")
-    ((found, failed),) = play_together([begun], [metric])
+    ((found,),), failed = play_scenarios(config, f"residual:{tmp_path / 'best'}", [metric])
     assert not failed.any()
-    assert row[metric] == row[f"base_{metric}"] == pytest.approx(found.mean(), rel=2e-5)
-    assert found.mean() != row[metric]
+    assert row[metric] == row[f"base_{metric}"] == pytest.approx(found, rel=2e-5)
+    assert found != row[metric]
 
 
 SEARCH: dict[str, Any] = {
@@ -517,26 +517,20 @@ def test_worlds_that_one_policy_cannot_play_are_no_mixture() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("env", ["testbed", "walker"])
-def test_episodes_played_together_score_as_alone(env: str) -> None:
-    """Catches scores of another world, episode, scenario or policy, and a fall that counts as a
-    score."""
+def test_scenarios_played_together_score_as_alone(env: str) -> None:
+    """Catches scores of another scenario or policy, and a fall that counts as a score."""
     motion: Any = SINE if env == "testbed" else {"step_period": [0.3, 0.4, 0.3], "num_steps": 1}
     base = "input" if env == "testbed" else "uncompensated"
     metric = "link_error_rms_rad" if env == "testbed" else "pelvis_error_rms_rad"
-    config = TrainConfig(
-        env=env, reference=motion, scenarios=["soft", "nominal", "sensor"], base=base
-    )
-    conditions = [
-        config.condition(scenario, base).replace(episodes=n)
-        for scenario, n in zip(config.scenarios, (2, 1, 3), strict=True)
-    ]
-    for (values, failed), condition in zip(
-        play_together(conditions, [metric]), conditions, strict=True
+    scenarios = ["soft", "ideal", "nominal", "sensor"]
+    config = TrainConfig(env=env, reference=motion, scenarios=scenarios, base=base)
+    for scenario, values, failed in zip(
+        scenarios, *play_scenarios(config, base, [metric]), strict=True
     ):
-        alone = evaluate(condition, num_threads=1)
-        assert values.shape == (condition.episodes, 1)
-        assert failed.sum() == alone.num_failed
-        np.testing.assert_array_equal(values[~failed, 0], alone.values(metric))
+        alone = evaluate(config.condition(scenario, base), num_threads=1)
+        assert failed == alone.num_failed
+        own = alone.values(metric)
+        np.testing.assert_array_equal(values, [own.mean() if len(own) else np.nan])
 
 
 def test_staggered_worlds_stand_all_over_the_walk() -> None:
@@ -568,13 +562,13 @@ def test_training_seeds_and_evaluation_seeds_are_disjoint(
 ) -> None:
     """Catches a policy that is scored on episodes that it learned from."""
     seen: list[Any] = []
-    reset = MixedVectorEnv.reset
+    reset = ElasticVectorEnv.reset
 
-    def spied(self: MixedVectorEnv, *, seed: Any = None, options: Any = None) -> Any:
+    def spied(self: ElasticVectorEnv, *, seed: Any = None, options: Any = None) -> Any:
         seen.append(seed)
         return reset(self, seed=seed, options=options)
 
-    monkeypatch.setattr(MixedVectorEnv, "reset", spied)
+    monkeypatch.setattr(ElasticVectorEnv, "reset", spied)
     config = TrainConfig(**{**SMALL, **PPO, "decisions": 32})
     for seed in (0, 1):
         Training(config, seed, tmp_path / str(seed)).run()
@@ -583,6 +577,13 @@ def test_training_seeds_and_evaluation_seeds_are_disjoint(
     assert len(trained) == 16  # four worlds begin twice, at first and behind the checkpoint
     assert [evaluated] in seen
     assert evaluated + 1_000 < min(trained)
+
+
+@pytest.mark.parametrize("key", ["env_options", "training_options"])
+def test_options_of_an_environment_are_refused_by_the_key_they_stand_in(key: str) -> None:
+    """Catches an argument that is found late, and one of trainings named as of all worlds."""
+    with pytest.raises(ConfigurationError, match=rf"^{key}: scenario cannot be given here"):
+        TrainConfig(**{key: {"scenario": "ideal"}})
 
 
 def test_residuals_learn_from_other_robots_than_they_are_evaluated_with() -> None:
@@ -701,6 +702,9 @@ def test_several_configurations_are_trained_in_one_pool(
     said = capsys.readouterr().out
     assert "both/a is complete" in said
     assert "both/b is complete" in said
+    shutil.copytree("both/a", "again/a")
+    main(["train", "--resume", "both/a", "again/a"])
+    assert "again/a is complete" in capsys.readouterr().out
 
 
 def test_a_training_seed_that_another_program_trains_is_left_alone(

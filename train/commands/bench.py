@@ -246,14 +246,19 @@ def _accept(path: Path, evaluations: list[Evaluation]) -> int:
     text = path.read_bytes().decode()
     cases = _child(yaml.compose(text), "cases").value
     changes = dict[tuple[int, int], str]()
+    last = 0
     for number, (case, evaluation) in enumerate(zip(cases, evaluations, strict=True)):
         figures = _child(case, "figures")
-        if figures is None or any(key.value == "<<" for key, _ in figures.value):
+        pairs = [] if figures is None else figures.value
+        places = [(value.start_mark.index, value.end_mark.index) for _, value in pairs]
+        # an alias stands before: where its anchor does
+        is_own = [*places] == sorted({*places}) and min(places, default=(0, 0))[0] > last
+        if not is_own or any(key.value == "<<" for key, _ in pairs):
             problem = f"{path}: figures of cases.{number} stand elsewhere"
             raise ConfigurationError(f"{problem}; give it figures of its own to update them")
-        for key, value in figures.value:
+        last = places[-1][0]
+        for place, (key, _) in zip(places, pairs, strict=True):
             if (measured := _score(evaluation, key.value)) is not None:
-                place = (value.start_mark.index, value.end_mark.index)
                 changes[place] = _rounded(measured.value)
     for (begin, end), value in sorted(changes.items(), reverse=True):
         text = text[:begin] + (value if end > begin else f" {value}") + text[end:]

@@ -23,6 +23,7 @@ from train.commands.options import OnHardware, name_options
 from train.evaluate.changes import changes, merge_seeds
 from train.evaluate.conditions import (
     Condition,
+    EnvOptions,
     GivenRanges,
     GivenReference,
     NumEpisodes,
@@ -98,7 +99,7 @@ class CompareConfig(CodeNamingModel):
     """Seed of the first episode."""
     ranges: GivenRanges = {}
     """Intervals that the robots of the scenario `drawn` are drawn from, in place of its own."""
-    env_options: dict[str, Any] = {}
+    env_options: EnvOptions = {}
     """Further arguments of the environment, such as stiffness."""
     figure_policies: list[str] = []
     """Policies that the time series show, by label or name; all if empty."""
@@ -503,14 +504,6 @@ class Compare(Model):
     """leaderboard.csv whose rows yours are appended to, and which are not played; `leaderboard` is
     the one of the package. It must be of the same version and protocol.
     """
-    jobs: int = 0
-    """Conditions that run at the same time, 0 for one per core; on hardware they come one after
-    the other.
-    """
-    on: str = "local"
-    """Executors: local, dask://HOST:PORT of a scheduler, slurm, or slurm:FILE.yaml; see
-    docs/cluster.md.
-    """
     resume: Path | None = None
     """Folder of a run to go on with: what is missing or has changed is played."""
     figure_format: plots.FigureFormat = "png"
@@ -519,6 +512,7 @@ class Compare(Model):
     """With --resume: play all cells again."""
     trust_code: bool = False
     """With --resume and no configuration: run the code that the run's own names."""
+    executors: Executors = Executors()
     hardware: OnHardware = OnHardware()
 
     def run(self, console: Console) -> None:
@@ -546,9 +540,8 @@ class Compare(Model):
             with name_options():
                 config = config.replace(episodes=self.episodes, scenario_episodes={})
         if self.policies:
-            own = [{"name": name} for name in self.policies]
             with name_options():
-                config = config.replace(policies=own, figure_policies=[])
+                config = config.replace(policies=list(self.policies), figure_policies=[])
         published = ()
         if self.published is not None:
             published = leaderboard.read_leaderboard(leaderboard.find_published(self.published))
@@ -557,16 +550,12 @@ class Compare(Model):
             real["env_options"] = {**config.env_options, **real["env_options"]}
             simulated = {"scenario_episodes": {}, "groups": {}}
             config = config.replace(scenarios=["hardware"], **simulated, **real)
-        with name_options():
-            executors = Executors(on=self.on, jobs=self.jobs)
-        output = self.resume or self.output
-        is_resumed = self.resume is not None
         finished = compare(
             config,
             console,
-            output,
-            executors,
-            resumes=is_resumed,
+            self.resume or self.output,
+            self.executors,
+            resumes=self.resume is not None,
             fresh=self.fresh,
             figure_format=self.figure_format,
             published=published,

@@ -65,7 +65,7 @@ class Evaluate(Model):
         options = {} if self.stiffness is None else {"stiffness": self.stiffness}
         observed = {"sensors": list(self.sensors)} if self.sensors else {}
         motion = {} if self.reference is None else {"references": [self.reference]}
-        with name_options():
+        with name_options(references="reference", scenarios="scenario", policies="policy"):
             config = CompareConfig(
                 name="evaluate",
                 scenarios=[self.on.scenario(self.scenario)],

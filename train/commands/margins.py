@@ -5,11 +5,11 @@ import json
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Annotated, Any, Literal, get_args
 
 from rich.console import Console
 
-from elastic_env.core.config import LARGEST_SEED, Entries, Locator, Model, Title, quantity
+from elastic_env.core.config import LARGEST_SEED, Entries, Locator, Model, Once, Title, quantity
 from elastic_env.core.files import write_whole
 from train.commands.compare import try_out
 from train.commands.options import MotionOrDefault
@@ -45,7 +45,12 @@ class Margins(Model):
     Example, one policy: elastic margins --policies input_output --robots 4 --quantities push_n
     """
 
-    policies: Entries[Locator] = ["input_output", "adaptive_posture", "foothold", "thormang"]
+    policies: Annotated[Entries[Locator], Once] = [
+        "input_output",
+        "adaptive_posture",
+        "foothold",
+        "thormang",
+    ]
     """Baselines, residual:PATH, "FILE.py:function" or "module:function"."""
     quantities: Entries[Field] = list(get_args(Field))
     """Fields of the scenario that are varied, one at a time."""
@@ -91,9 +96,7 @@ class Margins(Model):
                     before = itertools.count(0, steps[number])
                     play = partial(self._play, before, partial(show, number))
                     records += find_margins(condition, chosen, self.robots, self.halvings, play)
-                    rows = [{**own} for own in records]
-                    for row in rows:
-                        del row["edges"]
+                    rows = [{k: v for k, v in own.items() if k != "edges"} for own in records]
                     write_records(rows, files[0])
                     write_whole(files[1], json.dumps(records, indent=2) + "\n")
         title = f"worst / median edge of {self.robots} robots, {conditions[0].reference_name}"

@@ -98,11 +98,8 @@ class OnHardware(Model):
         if self.port is None and self.mounting is None:
             for name in ("imu_port", "yes", "patient"):
                 if getattr(self, name):
-                    option = "--" + name.replace("_", "-")
-                    problem = (
-                        f"{option} is for a real testbed: name its servo's port too, with --port"
-                    )
-                    raise ConfigurationError(problem)
+                    wanted = "is for a real testbed: name its servo's port too, with --port"
+                    raise ConfigurationError(f"{_option(name)} {wanted}")
             return {}
         confirm = False if self.yes else None
         options = {"port": self.port, "imu_port": self.imu_port, "confirm": confirm}
@@ -139,34 +136,38 @@ class OnHardware(Model):
             ConfigurationError: A scenario is named for hardware.
         """
         if not self.arguments:
-            return named or DEFAULT_SCENARIO
+            return DEFAULT_SCENARIO if named is None else named
         if named is not None:
             problem = f"scenario {named!r} is of a simulation, hardware is what it is"
             raise ConfigurationError(f"{problem}: leave --scenario out, or --port")
         return "hardware"
 
 
-_OF_ONE = {"references": "reference", "scenarios": "scenario", "policies": "policy"}
-"""Options that give a list of a configuration its only entry."""
-
-
-def option_name(path: ParameterPath) -> str:
-    """A parameter as the option that sets it."""
-    name = str(path[0]) if path else ""
-    return f"--{_OF_ONE.get(name, name).replace('_', '-')}" if path else ""
-
-
 def given_options(options: Model, names: Iterable[str]) -> list[str]:
     """Options that differ from their defaults, as they are spelt."""
     fields = type(options).model_fields
     given = [name for name in names if getattr(options, name) != fields[name].default]
-    return [option_name((name,)) for name in given]
+    return list(map(_option, given))
 
 
 @contextmanager
-def name_options() -> Iterator[None]:
-    """Let errors of a configuration that is made from options name the options."""
+def name_options(**of_one: str) -> Iterator[None]:
+    """Let errors of a configuration that is made from options name the options.
+
+    Args:
+        **of_one: Options that give a list of the configuration its only entry, by its name.
+    """
+
+    def spelt(path: ParameterPath) -> str:
+        name = str(path[0]) if path else ""
+        return _option(of_one.get(name, name)) if path else ""
+
     try:
         yield
     except ModelError as error:
-        raise ConfigurationError(error.describe(spelt=option_name)) from None
+        raise ConfigurationError(error.describe(spelt=spelt)) from None
+
+
+def _option(name: str) -> str:
+    """A field as the option that sets it."""
+    return f"--{name.replace('_', '-')}"

@@ -59,15 +59,8 @@ def play(
             _window(played, period)
         else:
             with show_progress(console, {"filming": steps}, transient=True, unit="film") as show:
-                _film(env, _counted(played, show), period, video)
+                _film(env, played, period, video, show)
             console.print(f"wrote {video}")
-
-
-def _counted(played: Iterable[Any], show: Show) -> Iterator[Any]:
-    """What is played, with its progress shown."""
-    for number, one in enumerate(played, 1):
-        yield one
-        show(0, number)
 
 
 def steps_within(task: Any, max_s: float | None) -> int:
@@ -115,7 +108,7 @@ def _window(episode: Iterable[_Step], period: float) -> None:
         time.sleep(max(0.0, begin + (step + 1) * period - time.perf_counter()))
 
 
-def _film(env: Any, episode: Iterable[_Step], period: float, video: Path) -> None:
+def _film(env: Any, episode: Iterable[_Step], period: float, video: Path, show: Show) -> None:
     if video.exists() or video.is_symlink():
         problem = f"{shorten(video)} exists and is not overwritten; name another file"
         raise ResultsExistError(problem)
@@ -137,15 +130,20 @@ def _film(env: Any, episode: Iterable[_Step], period: float, video: Path) -> Non
         writer: Any = imageio.get_writer(memory, "gif", duration=1e3 * frame_s)
     else:
         writer = imageio.get_writer(video, fps=1.0 / frame_s)
-    with writer:
-        for step, _ in episode:
-            if step % every == 0:
-                writer.append_data(env.render())
-                frames += 1
-    if is_gif:
-        video.write_bytes(memory.getbuffer())
-    else:
-        _require_whole(video, frames)
+    try:
+        with writer:
+            for step, _ in episode:
+                if step % every == 0:
+                    writer.append_data(env.render())
+                    frames += 1
+                show(0, step + 1)
+        if is_gif:
+            video.write_bytes(memory.getbuffer())
+        else:
+            _require_whole(video, frames)
+    except BaseException:
+        video.unlink(missing_ok=True)  # what is not whole would stand in the way of the next one
+        raise
 
 
 def _require_whole(video: Path, frames: int) -> None:

@@ -9,7 +9,7 @@ from rich.console import Console
 from elastic_env.core.config import Model, load_yaml
 from elastic_env.core.errors import ConfigurationError
 from train.commands.options import name_options
-from train.learn.run_training import resume, start
+from train.learn.run_training import ONE_BY_ONE, resume, start
 from train.learn.train_config import TrainConfig
 from train.runs.presets import find_configuration, print_presets
 from train.workers.executors import Executors
@@ -43,14 +43,7 @@ class Train(Model):
     """With --resume: run the code that the run's algorithm names, where it is none of
     Stable-Baselines3's.
     """
-    jobs: int = 1
-    """Seeds at a time, 0 for one per core; several share the cores, and all of them end sooner
-    than one by one.
-    """
-    on: str = "local"
-    """Executors: local, dask://HOST:PORT of a scheduler, slurm, or slurm:FILE.yaml; see
-    docs/cluster.md.
-    """
+    executors: Executors = ONE_BY_ONE
 
     def run(self, console: Console) -> None:
         """Train, go on with it, or list the presets."""
@@ -69,15 +62,13 @@ class Train(Model):
                 "a run goes on as it was begun: --resume takes no --seeds, --decisions or --output"
             )
             raise ConfigurationError(problem)
-        with name_options():
-            executors = Executors(on=self.on, jobs=self.jobs)
         if self.resume:
-            folders = resume(self.resume, console, executors, self.trust_code)
+            folders = resume(self.resume, console, self.executors, self.trust_code)
         else:
             files = [find_configuration(file, "training") for file in self.config]
             configs = [load_yaml(file, TrainConfig) for file in files]
             with name_options():
                 configs = [config.replace(**changes) for config in configs]
-            folders = start(configs, console, self.output, executors)
+            folders = start(configs, console, self.output, self.executors)
         for folder in folders:
             console.print(f"policies in {folder}/seed_*/best and last")

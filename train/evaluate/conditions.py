@@ -39,7 +39,8 @@ def _options(value: dict[str, Any]) -> dict[str, Any]:
     return value
 
 
-_EnvOptions = Annotated[dict[str, Any], AfterValidator(_options)]
+EnvOptions = Annotated[dict[str, Any], AfterValidator(_options)]
+"""Further arguments of an environment, none of which has a place of its own."""
 
 
 def _reference(value: Any) -> Reference:
@@ -102,7 +103,7 @@ class PolicySpec(Model):
     """How tables and figures call it; None for its name."""
     options: dict[str, Any] = {}
     """Keyword arguments of `baselines.make`, or of one's own function."""
-    env_options: _EnvOptions = {}
+    env_options: EnvOptions = {}
     """Arguments of the environment for this policy alone, such as form: rigid."""
     level: bool = False
     """In a sweep: whether it plays once without the swept option, as a level to compare with."""
@@ -145,7 +146,7 @@ class Condition(Model):
     label: str | None = None
     """How tables and figures call the reference; None for what the environment calls it."""
     scenario: Title = "nominal"
-    env_options: _EnvOptions = {}
+    env_options: EnvOptions = {}
     """Further arguments of the environment, such as stiffness."""
     ranges: GivenRanges = {}
     """Intervals in place of those of the scenario, where it draws robots from ranges."""

@@ -147,7 +147,7 @@ def _walk(
 ) -> Causes:
     policy = make_policy(condition.policy, env, condition.policy_options)
     causes = np.full(len(seeds), "", dtype=np.dtype("U64"))
-    for step in control_steps(env, policy, list(seeds), condition, is_once=True):
+    for step in control_steps(env, policy, list(seeds), condition):
         failed = np.asarray(step.terminated) & (causes == "")
         causes[failed] = step.info["termination"][failed]
         progress(step.number + 1)

@@ -308,9 +308,7 @@ def _set_options(options: Options) -> Options:
     return {name: value for name, value in options.items() if value is not None}
 
 
-def _natural(path: Path) -> list[tuple[int, int, str]]:
-    """Key that sorts seed_2 before seed_10."""
-    return [
-        (0, int(part), "") if part.isdigit() else (1, 0, part)
-        for part in re.split(r"(\d+)", str(path))
-    ]
+def _natural(path: Path) -> list[int | str]:
+    """Key that sorts seed_2 before seed_10: texts and numbers in turn."""
+    parts = re.split(r"(\d+)", str(path))
+    return [int(part) if part.isdecimal() else part for part in parts]

@@ -70,16 +70,12 @@ def control_steps(
     seed: Any,
     condition: Condition | None = None,
     watch: Watch | None = None,
-    is_once: bool = False,
 ) -> Iterator[ControlStep]:
     """Play a policy from a reset on, one control step at a time, in one world or in many.
 
     A scalar environment stops at the end of its episode. The worlds of a vector environment go on,
-    each with the next episode: by themselves, or in mode `DISABLED` by a reset here. Whoever reads
-    the steps stops when there are enough.
-
-    Played once, the worlds of mode `DISABLED` begin no other episode. What a world does after its
-    end means nothing, and the steps end when all have ended.
+    each with the next episode, and whoever reads the steps stops when there are enough. In mode
+    `DISABLED` the steps end when all worlds have ended; what one does after its end means nothing.
 
     Args:
         env: The environment.
@@ -87,7 +83,6 @@ def control_steps(
         seed: Of the reset; of a vector environment one for each world, or one for all.
         condition: What is played, for the errors of the policy; None to let them pass.
         watch: Called between the command and the step.
-        is_once: Whether every world of mode `DISABLED` plays one episode.
 
     Raises:
         PolicyFailedError: The policy of the condition failed.
@@ -117,10 +112,8 @@ def control_steps(
         observation = after
         is_over = step.is_over
         has_ended = has_ended | is_over
-        if (is_once or not is_vector) and has_ended.all():
+        if mode in (None, AutoresetMode.DISABLED) and has_ended.all():
             return
-        if mode is AutoresetMode.DISABLED and is_over.any() and not is_once:
-            observation, _ = env.reset(options={"reset_mask": is_over})
         # by itself a world begins anew in the step after its end
         begins = was_over if mode is AutoresetMode.NEXT_STEP else is_over
         was_over = is_over

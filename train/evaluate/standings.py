@@ -141,7 +141,7 @@ def standings(
                 best = _paired(table, scope, _best(table, beside, column), column)
             level = score(rows, column)
             standing = Standing(
-                track=table.condition(scope.policy).track,
+                track=scope.first.track,
                 policy=scope.policy,
                 reference=scope.reference,
                 scope=scope.scope,

@@ -123,22 +123,6 @@ def interquartile_mean(values: Array, axis: int = -1) -> Any:
     return np.where(np.squeeze(is_unknown, axis=axis), np.nan, trimmed)[()]
 
 
-def worst_share_mean(values: Array, share: float = WORST) -> float:
-    """Mean of the highest share of some values, their CVaR [Rockafellar2000]; nan of none.
-
-    The value at the edge counts in part, so that 32 values have a worst tenth of 3.2. A tenth of
-    fewer than ten is the highest.
-
-    [Rockafellar2000] R. T. Rockafellar, S. Uryasev, "Optimization of Conditional Value-at-Risk", J.
-    Risk 2(3).
-    """
-    if len(values) == 0:
-        return float("nan")
-    counted = max(share * len(values), 1.0)
-    weights = np.clip(counted - np.arange(len(values)), 0.0, 1.0)
-    return float(weights @ np.sort(values)[::-1] / counted)
-
-
 def beats(mine: Any, base: Any) -> Any:
     """1 where a policy is better (lower) than its base, one half in a tie, else 0."""
     return (mine < base) + 0.5 * (mine == base)
@@ -205,7 +189,14 @@ def middle_half(n: Array) -> tuple[Array, Array]:
 
 
 def worst_share(n: Array) -> tuple[Array, Array]:
-    """The part of `worst_share_mean`."""
+    """The highest tenth, whose mean is the CVaR [Rockafellar2000].
+
+    The value at the edge counts in part, so that 32 values have a worst tenth of 3.2. A tenth of
+    fewer than ten is the highest.
+
+    [Rockafellar2000] R. T. Rockafellar, S. Uryasev, "Optimization of Conditional Value-at-Risk", J.
+    Risk 2(3).
+    """
     return n - np.maximum(WORST * n, 1.0), n
 
 

@@ -158,10 +158,6 @@ class EpisodeTable:
         """Residuals by title, with how they were trained."""
         return {title: origin([*own.values()]) for title, own in self.members.items()}
 
-    def condition(self, policy: str) -> Condition:
-        """The first condition of a policy."""
-        return next(c for (title, _), c in self.conditions.items() if title == policy)
-
     def cells_of(
         self, policy: str, reference: str | None = None, scenario: str | None = None
     ) -> list[int]:
@@ -219,16 +215,6 @@ class EpisodeTable:
     def _parts(self) -> dict[tuple[str, int], pd.DataFrame]:
         parts: Any = self.rows.groupby(["policy", "cell"])
         return dict(iter(parts))
-
-
-def per_seed(rows: pd.DataFrame, metric: str) -> Array:
-    """A mean for each training seed and cell, (seeds, cells); nan without a figure."""
-    parts: Any = rows.groupby(["member", "cell"])[metric]
-    known = {key: own.dropna().to_numpy() for key, own in parts}
-    found = {key: float(np.mean(own)) for key, own in known.items() if len(own)}
-    cells = rows["cell"].unique()
-    members = rows["member"].unique()
-    return np.array([[found.get((m, c), np.nan) for c in cells] for m in members])
 
 
 class ByRobot:

@@ -28,7 +28,7 @@ _DASHED = ("zero", "rigid", "uncompensated_open", "input_open")
 
 def policy_colours(policies: Sequence[str]) -> dict[str, str]:
     """A colour for every policy: those without one of their own take the others in turn."""
-    unnamed = [policy for policy in policies if policy not in COLOURS]
+    unnamed = [policy for policy in dict.fromkeys(policies) if policy not in COLOURS]
     return {
         policy: COLOURS.get(policy) or STRONG[unnamed.index(policy) % len(STRONG)]
         for policy in policies

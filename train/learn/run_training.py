@@ -37,11 +37,6 @@ class Run:
     folder: Path
 
     @property
-    def here(self) -> "Run":
-        """The same with the whole path of its folder, for workers."""
-        return Run(self.config, self.folder.resolve())
-
-    @property
     def is_complete(self) -> bool:
         """True if all training seeds have come to their end."""
         seeds = self.config.seeds
@@ -122,7 +117,7 @@ def _train(runs: Sequence[Run], console: Console, executors: Executors) -> None:
     calls = [(run, seed) for run in runs for seed in run.config.seeds]
     names = [f"seed {seed}" for _, seed in calls]
     if len(runs) > 1:
-        names = [f"{run.folder.name}, seed {seed}" for run, seed in calls]
+        names = [f"{run.folder}, seed {seed}" for run, seed in calls]
     decisions = [run.config.decisions for run, _ in calls]
     totals = dict(zip(names, decisions, strict=True))
     with show_progress(console, totals, unit="decisions") as show:
@@ -131,7 +126,7 @@ def _train(runs: Sequence[Run], console: Console, executors: Executors) -> None:
                 _train_seed(run, seed, 0, partial(show, number))
         else:
             threads = executors.threads_per_call(len(calls))
-            given = [(run.here, seed, threads) for run, seed in calls]
+            given = [(Run(r.config, r.folder.resolve()), seed, threads) for r, seed in calls]
             watch = _watch(names, console, show)
             with executors.open_pool(len(given), runs[0].folder) as pool:
                 # Ctrl-C ends at once: a seed may take hours, and goes on from its checkpoint

@@ -1,6 +1,5 @@
 """Our vector environments for Stable-Baselines3: arrays in, arrays out, no loop over worlds."""
 
-from collections.abc import Sequence
 from typing import Any
 
 import gymnasium
@@ -142,7 +141,3 @@ class SB3VecEnv(VecEnv):
         from stable_baselines3.common.monitor import Monitor
 
         return [wrapper_class is Monitor for _ in self._get_indices(indices)]
-
-    def get_images(self) -> Sequence[Any]:
-        """Vector environments are not rendered."""
-        return [None for _ in range(self.num_envs)]

@@ -18,6 +18,7 @@ from elastic_env.core.errors import ConfigurationError, require_known
 from elastic_env.registration import require_memory
 from train.evaluate.conditions import (
     Condition,
+    EnvOptions,
     GivenRanges,
     GivenReference,
     NumEpisodes,
@@ -56,9 +57,9 @@ class TrainConfig(CodeNamingModel):
     """How much the rewards of single scenarios count, at most 10⁶; 1 where nothing is said."""
     ranges: GivenRanges = {}
     """Intervals that the robots of `drawn` are drawn from, in place of its own."""
-    env_options: dict[str, Any] = {}
+    env_options: EnvOptions = {}
     """Further arguments of the environment, such as the weights of its reward."""
-    training_options: dict[str, Any] = {}
+    training_options: EnvOptions = {}
     """The same for the worlds that are learned from alone, such as a longer physics step."""
     base: Title = "input_output"
     """Policy that is corrected: a baseline by name, since an exported residual plays without

@@ -7,8 +7,6 @@ are kept.
 import shutil
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import closing
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -19,13 +17,12 @@ from baselines.residual.residual_policy import save_residual
 from baselines.residual.settings import ResidualDescription
 from elastic_env.core.errors import ConfigurationError, ElasticError, shorten
 from elastic_env.core.files import read_bounded, write_whole
-from elastic_env.core.signals import Array, BoolArray
-from train.evaluate.conditions import Condition
+from elastic_env.core.signals import Array, IntArray
 from train.evaluate.environments import environment
+from train.evaluate.episodes import evaluate_together, group_by
 from train.evaluate.progress import MOST_BYTES, PROGRESS
-from train.evaluate.rollout import control_steps, make_policy
+from train.evaluate.rollout import shared_settings
 from train.learn import checkpoint as checkpoints
-from train.learn.mixed_env import mixed_env
 from train.learn.train_config import TrainConfig
 from train.runs.folders import provenance
 
@@ -54,7 +51,7 @@ def require_finite(quantity: str, values: Any) -> None:
 
 CHECKPOINT = "checkpoint"
 """Folder, within that of a training seed, to go on from."""
-_Scored = tuple[Array, Array]
+Scores = tuple[Array, IntArray]
 """Means of metrics over the episodes that did not fail, (scenarios, metrics), and how many did,
 (scenarios,).
 """
@@ -79,7 +76,7 @@ class Trainer(ABC):
         self._kept: int | None = None
         self._provenance = provenance(seed)
         self._table = ""
-        self._base: _Scored | None = None
+        self._base: Scores | None = None
         self._best: float | None = None
         """Score of the best policy so far: mean ratio to the base, and what falls cost."""
         self._prepare(threads)
@@ -177,11 +174,12 @@ class Trainer(ABC):
         current = self._keep_policy("current")
         columns = [column.metric for column in environment(self.config.env).judged]
         if self._base is None:
-            self._base = self._play_policy(self.config.base, columns)
+            self._base = play_scenarios(self.config, self.config.base, columns, self._threads)
         base, base_failed = self._base
         mine, failed = self._base
         if self.done > 0:
-            mine, failed = self._play_policy(f"residual:{current}", columns)
+            name = f"residual:{current}"
+            mine, failed = play_scenarios(self.config, name, columns, self._threads)
         names = self.config.scenarios
         table = pd.DataFrame({"decisions": self.done, "scenario": names})
         table[columns] = mine
@@ -246,47 +244,27 @@ class Trainer(ABC):
         self._table = "".join([lines[0], *kept])
         write_whole(path, self._table)
 
-    def _play_policy(self, policy: str, metrics: list[str]) -> _Scored:
-        """Scores of a policy in every scenario."""
-        conditions = [self.config.condition(name, policy) for name in self.config.scenarios]
-        results = play_together(conditions, metrics, self._threads)
-        means = [
-            [np.mean(some) if len(some) else np.nan for some in scores[~failed].T]
-            for scores, failed in results
-        ]
-        return np.array(means), np.array([failed.sum() for _, failed in results])
 
-
-def play_together(
-    conditions: Sequence[Condition], metrics: Sequence[str], num_threads: int = 0
-) -> list[tuple[Array, BoolArray]]:
-    """Play the episodes of several conditions at once: scores as of `evaluate`, without traces.
+def play_scenarios(
+    config: TrainConfig, policy: str, metrics: Sequence[str], num_threads: int = 0
+) -> Scores:
+    """Scores of a policy in every scenario of a training, on the episodes of its evaluations.
 
     Args:
-        conditions: Cells of one environment, motion and policy.
+        config: What is trained.
+        policy: Name of the policy.
         metrics: Names of scores.
         num_threads: Threads, 0 for all cores.
-
-    Returns:
-        For each condition the scores, (episodes, metrics), and which episodes failed, (episodes,).
     """
-    sizes = [condition.episodes for condition in conditions]
-    spans = [range(own.seed, own.seed + own.episodes) for own in conditions]
-    seeds = [*chain(*spans)]
-    values = np.full((len(seeds), len(metrics)), np.nan)
-    failed = np.zeros(len(seeds), dtype=np.bool_)
-    playing = np.ones_like(failed)
-    with closing(mixed_env(conditions, sizes, num_threads)) as worlds:
-        policy = make_policy(conditions[0].policy, worlds)
-        for step in control_steps(worlds, policy, seeds):
-            first = playing & step.is_over
-            if first.any():
-                found = step.info["episode_metrics"]
-                scores = np.stack([found[name] for name in metrics], axis=1)
-                values[first] = scores[first]
-                failed[first] = step.terminated[first]
-                playing &= ~first
-            if not playing.any():
-                break
-    parts = np.cumsum(sizes)[:-1]
-    return list(zip(np.split(values, parts), np.split(failed, parts), strict=True))
+    conditions = [config.condition(scenario, policy) for scenario in config.scenarios]
+    played = {
+        found.condition.scenario: found
+        for own in group_by(conditions, shared_settings).values()
+        for found in evaluate_together(own, num_threads=num_threads)
+    }
+    results = [played[scenario] for scenario in config.scenarios]
+    means = [
+        [np.mean(some) if len(some) else np.nan for some in map(own.values, metrics)]
+        for own in results
+    ]
+    return np.array(means), np.array([own.num_failed for own in results])

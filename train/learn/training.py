@@ -88,26 +88,21 @@ class Training(Trainer):
         self.model.action_space.seed(seed)
 
     def run(self, progress: Callable[[int], None] | None = None) -> None:
-        """Learn to the end, and raise here what TensorBoard's thread could not write."""
-        with _thread_raises_here(), self._curves():
-            super().run(progress)
+        """Learn to the end, and raise here what TensorBoard's thread could not write.
 
-    @contextmanager
-    def _curves(self) -> Iterator[None]:
-        """Write TensorBoard's files of the work within.
-
-        Its thread ends with it, whatever ended that.
+        That thread ends with the work, whatever ended that.
         """
-        curves = Curves(str(self.folder / "tensorboard"), self.model, self._worlds)
-        self.model.set_logger(curves)
-        self._shown = curves
-        try:
-            yield
-        except BaseException:
-            with suppress(Exception):  # what ended the work is what is said
-                curves.close()
-            raise
-        curves.close()
+        with _thread_raises_here():
+            curves = Curves(str(self.folder / "tensorboard"), self.model, self._worlds)
+            self.model.set_logger(curves)
+            self._shown = curves
+            try:
+                super().run(progress)
+            except BaseException:
+                with suppress(Exception):  # what ended the work is what is said
+                    curves.close()
+                raise
+            curves.close()
 
     @property
     def done(self) -> int:

@@ -136,13 +136,11 @@ def _means(row: Change) -> str:
 
 
 def _seeds(rows: Sequence[Change]) -> str:
-    seeds = sorted({row.num_seeds for row in rows})
+    over = named_intervals(row.relative for row in rows) or "no interval"
     if not rows[0].is_family:
-        return named_intervals(row.relative for row in rows) or "no interval"
-    if seeds == [1]:
-        named = named_intervals(row.relative for row in rows)
-        return f"one training seed, {named or 'no interval'}"
-    return f"interquartile mean with interval, {named_intervals(row.relative for row in rows)}"
+        return over
+    is_one = {row.num_seeds for row in rows} == {1}
+    return f"{'one training seed' if is_one else 'interquartile mean with interval'}, {over}"
 
 
 def _opponent(rows: Sequence[Change]) -> str:

@@ -259,7 +259,7 @@ def read_leaderboard(path: Path) -> list[Standing]:
         except ValidationError as error:
             said = error.errors()[0]["msg"]
             raise ConfigurationError(f"{shorten(path)} is no leaderboard.csv: {said}") from None
-        except (KeyError, TypeError, ValueError) as error:
+        except (KeyError, TypeError, ValueError, csv.Error) as error:
             problem = f"{shorten(path)} is no leaderboard.csv: {error!r}"
             raise ConfigurationError(problem) from None
     if not found:

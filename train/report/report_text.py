@@ -8,7 +8,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
 import pandas as pd
 
 from train.evaluate import changes as terms
@@ -21,7 +20,7 @@ from train.evaluate.residual_seeds import Origin
 from train.evaluate.robots import RobotScores
 from train.evaluate.standings import Standing
 from train.evaluate.statistics import Estimate
-from train.evaluate.table import EpisodeTable, failures, per_seed
+from train.evaluate.table import EpisodeTable, failures
 from train.figures.colours import policy_colours
 from train.report.table_formats import load_template
 
@@ -168,10 +167,8 @@ def _scores(rows: pd.DataFrame, column: Column) -> Scores:
     """Mean of every policy over training seeds and cells [SI], and failures."""
     found = {}
     for title, own in rows.groupby("policy", sort=False):
-        values = per_seed(own, column.metric)
-        known = values[np.isfinite(values)]
-        mean = float(known.mean()) if len(known) else float("nan")
-        found[str(title)] = Estimate(mean), failures(own)
+        means: Any = own.groupby(["member", "cell"])[column.metric].mean()
+        found[str(title)] = Estimate(float(means.mean())), failures(own)
     return found
 
 

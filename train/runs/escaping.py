@@ -47,15 +47,10 @@ def csv_cell(value: Any) -> Any:
     return f"'{text}" if is_formula else text
 
 
-def csv_row(values: Iterable[Any]) -> list[Any]:
-    """A row of a CSV file."""
-    return [csv_cell(value) for value in values]
-
-
 def write_csv(head: Sequence[str], rows: Iterable[Iterable[Any]], path: Path) -> Path:
     """Write a CSV file."""
     text = io.StringIO(newline="")
-    csv.writer(text).writerows(map(csv_row, [head, *rows]))
+    csv.writer(text).writerows(map(csv_cell, row) for row in [head, *rows])
     write_whole(path, text.getvalue())
     return path
 

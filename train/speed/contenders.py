@@ -20,7 +20,6 @@ from baselines.residual.residual_policy import Network, ResidualPolicy
 from baselines.residual.settings import ResidualDescription, ResidualSettings
 from elastic_env.core.signals import Array
 from train.evaluate.conditions import Condition, PolicySpec
-from train.evaluate.environments import environment
 from train.evaluate.rollout import make_policy, make_vector_env, policy_errors
 
 PPO_DECISIONS = 512
@@ -257,16 +256,14 @@ class PPOLoop(Contender):
         where = f"SubprocVecEnv({n})" if threads is None else "vector env"
         self.title = f"PPO with {policy}, {where}"
         self.num_envs = n
-        has_model = policy not in ("zero", "uncompensated", "uncompensated_open")
-        acts_on = {DEFLECTION if has_model else COMMAND: None}
         if threads is None:
-            maker = partial(_make_corrected, env, policy, acts_on)
+            maker = partial(_make_corrected, env, policy)
             venv: Any = SubprocVecEnv([maker] * n, start_method="spawn")
         else:
             condition = _condition(env, policy)
-            mode = AutoresetMode.SAME_STEP
-            inner = make_vector_env(condition, n, threads, mode)
-            venv = SB3VecEnv(ResidualVectorWrapper(inner, policy, acts_on=acts_on))
+            inner = make_vector_env(condition, n, threads, AutoresetMode.SAME_STEP)
+            base = make_policy(condition.policy, inner)
+            venv = SB3VecEnv(ResidualVectorWrapper(inner, base, acts_on=_acts_on(base)))
         self._period = ResidualSettings().decision_period
         torch.set_num_threads(1)
         self._rollout = max(PPO_DECISIONS // n, 8)
@@ -296,9 +293,8 @@ class PPOLoop(Contender):
 
 def untrained_residual(base: Any, env: Any) -> ResidualPolicy:
     """A residual with an untrained network of 64×64, small random weights, on a base policy."""
-    acts_on = DEFLECTION if DEFLECTION in inputs_of(base) else COMMAND
     model = env.unwrapped.assumed_model
-    corrected = Corrected(base, model, ResidualSettings(acts_on={acts_on: None}))
+    corrected = Corrected(base, model, ResidualSettings(acts_on=_acts_on(base)))
     features = Features(corrected).width
     generator = np.random.default_rng(0)
     tensors = {"mean": np.zeros(features), "std": np.ones(features)}
@@ -311,20 +307,26 @@ def untrained_residual(base: Any, env: Any) -> ResidualPolicy:
     return ResidualPolicy(corrected, Network(description, tensors))
 
 
+def _acts_on(base: Any) -> dict[str, Any]:
+    """The input of a base that a residual acts on, with its default bound."""
+    return {DEFLECTION if DEFLECTION in inputs_of(base) else COMMAND: None}
+
+
 def _condition(env: str, policy: str | None = None) -> Condition:
     spec = PolicySpec(name=policy or "zero")
     return Condition(env=env, policy=spec)
 
 
-def _make(env: str) -> Any:
-    """A scalar environment, also in a process of its own."""
-    import elastic_env  # noqa: F401  registers the environments
+def _make(env: str, policy: str | None = None) -> Any:
+    """A scalar environment with what a policy needs, also in a process of its own."""
+    condition = _condition(env, policy)
+    return gymnasium.make(condition.environment.id, **condition.arguments)
 
-    return gymnasium.make(environment(env).id, **_condition(env).arguments)
 
-
-def _make_corrected(env: str, policy: str, acts_on: dict[str, None]) -> Any:
+def _make_corrected(env: str, policy: str) -> Any:
     """A scalar environment with the residual of a base policy around it."""
     from baselines.residual_env import ResidualWrapper
 
-    return ResidualWrapper(_make(env), policy, acts_on=acts_on)
+    made = _make(env, policy)
+    base = make_policy(_condition(env, policy).policy, made)
+    return ResidualWrapper(made, base, acts_on=_acts_on(base))

@@ -18,11 +18,12 @@ _NAMES = rf"(?s)^({_LOCAL}|{_DASK}.+:\d+|slurm(:.*)?)$"
 
 
 class Executors(Model):
-    """Executors of calls beside each other: cells of a comparison, or training seeds."""
+    """Where cells of a comparison, or training seeds, run beside each other."""
 
     jobs: int = quantity("1", 0, ge=0, le=1024)
-    """Calls that run at the same time on this machine, 0 for one per core; several share the cores.
-    On hardware cells come one after the other; a cluster says itself how many."""
+    """Cells, or training seeds, at a time on this machine, 0 for one per core; several share the
+    cores, and all of them end sooner than one by one. On hardware cells come one after the other; a
+    cluster says itself how many."""
     on: str = Field(default=_LOCAL, pattern=_NAMES)
     """Executors: local, dask://HOST:PORT of a scheduler, slurm, or slurm:FILE.yaml with what a job
     asks for; see docs/cluster.md."""
