@@ -60,7 +60,7 @@ def test_what_is_passed_solves_the_equation(torque: float, speed: float, directi
     """Catches a share of the load that the link needs in place of the load that is passed."""
     one = np.ones(1)
     memory = FrictionMemory(0.05 * direction * one, direction * one, 0.0 * one)
-    passed = FRICTION.passed(torque * one, speed * one, memory)
+    passed = FRICTION.joint_torque(torque * one, speed * one, memory)
     friction = dry_friction(speed * one, passed, 0.05, 0.4, 0.03, 0.1)
     np.testing.assert_allclose(passed, torque + direction * friction, atol=1e-12)
 
@@ -93,7 +93,7 @@ def test_a_reference_at_rest_with_noise_does_not_make_the_torque_jump(settled: f
     passed: list[float] = []
     for before, now in pairwise(noise):
         memory = FRICTION.follow(np.array([now - before]), memory)
-        passed.append(float(FRICTION.passed(torque, np.zeros(1), memory)[0]))
+        passed.append(float(FRICTION.joint_torque(torque, np.zeros(1), memory)[0]))
     assert np.ptp(passed) < 1e-12
 
 

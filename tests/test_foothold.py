@@ -64,11 +64,11 @@ class ClosedLegs:
             observed[:, self.table.group("load_share")] = self.plan.share[row]
             _, state = self.policy.predict(observed, state, np.array([row == 1]))
             before = offset
-            offset = state.footholds["offset"][0]
+            offset = state.own["offset"][0]
             self.largest_step = max(self.largest_step, float(np.abs(offset - before).max()))
             if timing.single[row - 1] and not timing.single[row]:
                 foot = 1 - int(timing.support[row])
-                aimed = self.place[1 - foot] + state.footholds["target"][0, foot]
+                aimed = self.place[1 - foot] + state.own["target"][0, foot]
                 self.place[foot] = aimed + LANDING_M[foot]
                 self.landed.append(self.place.copy())
         self.state = state
