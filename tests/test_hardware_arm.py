@@ -709,9 +709,13 @@ def test_options_that_contradict_are_refused(changes: dict[str, Any], words: str
 
 
 def test_an_emulated_arm_needs_all_its_files() -> None:
-    """Catches pendulums behind the servos where somebody asked for an arm."""
+    """Catches pendulums behind the servos where somebody asked for an arm, and options of
+    pendulums that nobody reads."""
     with pytest.raises(ConfigurationError, match="needs --robot, --joints and --mounting"):
         Emulate(robot=ROBOT)._arm()
+    own = Emulate(robot=ROBOT, joints=JOINTS, mounting=MOUNTING, ids=[7], stiffness=5.0)
+    with pytest.raises(ConfigurationError, match="leave out --ids, --stiffness"):
+        own._arm()
     config = Emulate(robot=ROBOT, joints=JOINTS, mounting=MOUNTING)._arm()
     assert config is not None
     assert config.arm is not None

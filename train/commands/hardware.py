@@ -16,7 +16,7 @@ from rich.markup import escape
 
 import elastic_env  # noqa: F401  registers the environments
 from elastic_env.core.config import Locator, Model, quantity
-from elastic_env.core.errors import ConfigurationError, require_known
+from elastic_env.core.errors import ConfigurationError, list_names, require_known
 from elastic_env.hardware.buses.packets import RANGE_OF_RATES, require_ids
 from elastic_env.hardware.buses.protocols import BUSES
 from elastic_env.hardware.buses.servo_models import Protocol, servo_model, servo_models
@@ -302,6 +302,16 @@ class Emulate(Model):
             return None
         if self.robot is None or self.joints is None or self.mounting is None:
             raise ConfigurationError("an emulated arm needs --robot, --joints and --mounting")
+        unused = [
+            "--" + name.replace("_", "-")
+            for name in ("ids", "model_number", "baudrate", "scenario", "stiffness")
+            if getattr(self, name) != Emulate.model_fields[name].default
+        ]
+        if unused:
+            raise ConfigurationError(
+                "an emulated arm has the joints of --joints and the servos of --mounting; leave out"
+                f" {list_names(unused)}"
+            )
         arm = OnArm(robot=self.robot, mounting=self.mounting, dry_run=True)
         return emulator_config(KnownArm(arm, self.joints))
 
