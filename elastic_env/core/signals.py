@@ -1,5 +1,6 @@
 """Named arrays that know their units: the columns of observations and actions."""
 
+import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -118,15 +119,23 @@ class SignalTable:
             return slice(indices[0], indices[0] + len(indices))
         return indices
 
+    @cached_property
+    def _groups(self) -> dict[str, list[int]]:
+        """Columns by the name of a signal, and by each part of it that ends before a dot."""
+        found: dict[str, list[int]] = {}
+        for i, name in enumerate(self.names):
+            for part in itertools.accumulate(name.split("."), "{}.{}".format):
+                found.setdefault(part, []).append(i)
+        return found
+
     def group(self, name: str) -> slice:
         """Columns of the signal of that name, or of those whose names begin with it and a dot.
 
         Raises:
             ConfigurationError: There is none, or they are not neighbours.
         """
-        start = f"{name}."
-        found = [i for i, own in enumerate(self.names) if f"{own}.".startswith(start)]
-        if not found:
+        found = self._groups.get(name)
+        if found is None:
             groups = dict.fromkeys(own.split(".")[0] for own in self.names)
             error = unknown_name("signal", name, groups)
             error.add_note("an environment's argument `sensors` adds signals to an observation")
