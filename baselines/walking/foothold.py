@@ -225,6 +225,8 @@ class FootholdGains(Model):
     [1]."""
     limit_m: float = quantity("m", 0.04, gt=0, le=0.05)
     """Largest offset of a foot forward and sideways [m]."""
+    return_load: float = quantity("1", 1.0, gt=0, le=1)
+    """Share of the load on a foot that has landed at which its offset is gone [1]."""
 
 
 FOOTHOLDS = record_type(
@@ -341,7 +343,8 @@ def correct_footholds(gains: Any, plan: Any, observed: Any, memory: Any, coming:
         else:
             own.swing = -1.0
             feel_landing(rules, planned, shown, own)
-            share = shown.load_share if foot == 0 else 1.0 - shown.load_share
+            unloaded = shown.load_share if foot == 0 else 1.0 - shown.load_share
+            share = max((unloaded - (1.0 - rules.return_load)) / rules.return_load, 0.0)
         for i in range(2):
             own.offset[1 - foot, i] = 0.0
             own.offset[foot, i] = share * own.target[foot, i]
