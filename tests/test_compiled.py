@@ -46,8 +46,6 @@ KERNELS = (
     "baselines.residual.residual_policy",
     "baselines.identification.servo_replay",
 )
-
-
 DECORATORS = ("compiled", "compiled_part", "within_compiled")
 
 
@@ -101,7 +99,7 @@ def test_every_compiled_function_is_looked_at() -> None:
 
 
 def test_the_package_calls_no_part_of_a_kernel_from_python() -> None:
-    """Catches a call that compiles a way in, in every process."""
+    """Catches a call that compiles an entry in every process."""
     parts: set[str] = set()
     for name in KERNELS:
         tree = ast.parse((ROOT / f"{name.replace('.', '/')}.py").read_text())

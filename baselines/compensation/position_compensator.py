@@ -53,8 +53,8 @@ from elastic_env.joint.model_file import GivenModel, compiled_model
 from elastic_env.joint.model_servo import position_servo
 from elastic_env.joint.supported_models import (
     commanded_hinges,
+    held_positions,
     hinges_of,
-    home_of,
     require_known_torque,
     require_robot,
 )
@@ -577,13 +577,6 @@ def _warn(message: str) -> None:
         frame = frame.f_back
         level += 1
     warnings.warn(message, stacklevel=level)
-
-
-def held_positions(model: mujoco.MjModel, joints: Sequence[str]) -> dict[int, float]:
-    """Positions of the joints that are not commanded, by their number [rad], [m]."""
-    home = home_of(model)
-    others = [j for j in range(model.njnt) if model.joint(j).name not in joints]
-    return {j: float(home[model.jnt_qposadr[j]]) for j in others}
 
 
 def _of_file(model: mujoco.MjModel, file: Path, commanded: Any) -> dict[str, Any]:

@@ -10,7 +10,7 @@ import numpy as np
 from baselines.compensation.position_compensator import PositionCompensator
 from elastic_env.core.errors import ConfigurationError, require_known
 from elastic_env.core.signals import Array
-from elastic_env.joint.supported_models import home_of
+from elastic_env.joint.supported_models import held_positions
 from elastic_env.rigid.tree.end_effector import EndEffector, outermost_body
 from elastic_env.world.robot_model import joint_ranges
 
@@ -127,10 +127,3 @@ def place_of(model: mujoco.MjModel, name: str) -> tuple[int, Array]:
         site = model.site(name)
         return int(site.bodyid[0]), site.pos.copy()
     return int(model.body(name).id), np.zeros(3)
-
-
-def held_positions(model: mujoco.MjModel, joints: Sequence[str]) -> dict[int, float]:
-    """Positions of the other joints by their numbers, as `PositionCompensator` holds them."""
-    home = home_of(model)
-    others = [j for j in range(model.njnt) if model.joint(j).name not in joints]
-    return {j: float(home[model.jnt_qposadr[j]]) for j in others}

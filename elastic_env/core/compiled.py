@@ -61,7 +61,7 @@ def _by_numba(function: Callable[_P, _R], **options: Any) -> Any:
 
 
 class _Part(Generic[_P, _R]):
-    """A function that compiled functions call; one from Python compiles a way in."""
+    """A function that compiled functions call. The first call from Python compiles an entry."""
 
     def __init__(self, kernel: Any) -> None:
         self.py_func = kernel.py_func

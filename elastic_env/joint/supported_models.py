@@ -122,6 +122,13 @@ def home_of(model: MjModel) -> Array:
     return model.key_qpos[0].copy() if model.nkey else model.qpos0.copy()
 
 
+def held_positions(model: MjModel, joints: Sequence[str]) -> dict[int, float]:
+    """Positions at home of all joints but these, by their numbers [rad], [m]."""
+    home = home_of(model)
+    others = [j for j in range(model.njnt) if model.joint(j).name not in joints]
+    return {j: float(home[model.jnt_qposadr[j]]) for j in others}
+
+
 def mass_matrix(model: MjModel, data: mujoco.MjData) -> Array:
     """Inertia of all joints with armature at the positions of a state, (nv, nv) [kg·m²]."""
     mujoco.mj_kinematics(model, data)

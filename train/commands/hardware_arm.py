@@ -18,7 +18,6 @@ from rich.table import Table
 from rich.text import Text
 
 from baselines import PositionCompensator
-from baselines.compensation.position_compensator import held_positions
 from baselines.identification.servo_log import known_loads
 from elastic_env.core.config import Locator, Model, load_yaml, quantity, read_mapping
 from elastic_env.core.errors import ConfigurationError
@@ -41,6 +40,7 @@ from elastic_env.hardware.settings import PATIENT_LIMITS
 from elastic_env.joint.joint_settings import JointSettings
 from elastic_env.joint.model_file import compiled_model
 from elastic_env.joint.small_servos import SMALL_SERVOS
+from elastic_env.joint.supported_models import held_positions
 from elastic_env.rigid.tree.end_effector import EndEffector, outermost_body
 from elastic_env.robots.robot.joints import STIFF_OVER_SERVO
 from train.runs.console import can_redraw, make_table, print_files

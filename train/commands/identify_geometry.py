@@ -16,9 +16,10 @@ from baselines.identification.geometry_result import (
 )
 from baselines.identification.holdout import Judged
 from baselines.identification.pose_log import PoseLog
-from baselines.identification.static_arm import held_positions, place_of
+from baselines.identification.static_arm import place_of
 from elastic_env.core.errors import list_names, unknown_name
 from elastic_env.joint.model_file import read_model
+from elastic_env.joint.supported_models import held_positions
 from elastic_env.rigid.tree.links import Tree
 from train.commands.held_out import judge_poses, number_or_dash, show_held_out
 from train.commands.identify_options import ArmOptions, GeometryOptions, IdentificationRun
