@@ -11,22 +11,22 @@ from train.evaluate.standings import Standing
 _RAW = "raw mj_step"
 _OURS = "vector env"
 _SHOWN = ("1", "64", "1024")
-"""Numbers of worlds in the table; `speed_*.csv` has more."""
+"""Numbers of worlds in the table of the CPU; `speed_*.csv` has more."""
 _OTHERS = ("Gymnasium AsyncVectorEnv", "SB3 SubprocVecEnv")
 _POLICIES = ("uncompensated", "input_output", "adaptive_posture", "foothold", "residual of 3 s")
 """Vector environments in two processes, and policies that are timed alone."""
 
 
-def vector_environments(*tables: Rows) -> str:
+def vector_environments(*tables: Rows, shown: Sequence[str] = _SHOWN) -> str:
     """Time of raw physics per world and control step, and how fast the vector environment is
-    beside it.
+    beside it, with these numbers of worlds.
     """
     lines = []
     rows = [
         row
         for table in tables
         for row in table
-        if row["against"] == f"{_RAW}, {row['num_envs']}" and row["num_envs"] in _SHOWN
+        if row["against"] == f"{_RAW}, {row['num_envs']}" and row["num_envs"] in shown
     ]
     rows = sorted(rows, key=lambda row: int(row["num_envs"]))
     for (env, worlds), own in sorted(

@@ -69,6 +69,10 @@ TABLES = {
         )
         for env in ("walker", "testbed")
     },
+    "speed_gpu": (
+        "copy it from speed.csv after `elastic speed --backend warp --num-envs 1024 4096 16384"
+        " --no-others --no-ppo --steps 20 --rounds 3`, and with --env testbed"
+    ),
     "cluster": "python -m tests.cluster_trials measures it",
     "servo_coverage": "python -m tests.servo_trials measures it",
     "arm_identification": "python -m tests.identification_trials measures it",
@@ -216,6 +220,9 @@ PARTS: Mapping[str, Part] = {
     ),
     "speed of vector environments": _of(
         speeds.vector_environments, "speed_walker", "speed_testbed"
+    ),
+    "speed on a GPU": _of(
+        partial(speeds.vector_environments, shown=("1024", "4096", "16384")), "speed_gpu"
     ),
     "speed of other ways": _of(speeds.other_ways, "speed_walker", "speed_testbed"),
     "costs of cells": _of(speeds.costs_of_cells, "cluster"),
