@@ -55,12 +55,16 @@ COMMAND_SHORT = "{step_period: [0.3, 0.5, 0.3], num_steps: 1}"
 CONFIGS = sorted((Path(__file__).parents[1] / "configs").glob("*.yaml"))
 TRAININGS = [path for path in CONFIGS if path.stem.startswith("train_")]
 COMPARISONS = [
-    pytest.param(path, id=path.stem, marks=[pytest.mark.slow] * path.stem.startswith("map_"))
+    pytest.param(
+        path,
+        id=path.stem,
+        marks=[pytest.mark.slow] * path.stem.startswith(("map_", "footholds")),
+    )
     for path in CONFIGS
     if path not in TRAININGS and path.stem != "bench"
 ]
 HIP_ROLL = 1
-"""Executors of the hip roll joint in a leg of six."""
+"""Place of the hip roll joint in a leg of six."""
 
 
 def walk(policy: str = "zero", reference: Any = None, **values: Any) -> Condition:
