@@ -947,6 +947,12 @@ def test_a_log_of_too_few_poses_is_fitted_whole() -> None:
     )
 
 
+def test_folds_of_nothing_are_refused() -> None:
+    """Catches folds that are asked for and silently not held out."""
+    with pytest.raises(ConfigurationError, match="holdout = 0 holds nothing out, got folds = 5"):
+        HoldoutOptions(holdout=0.0, folds=5)
+
+
 def test_chosen_joints_alone_are_sought() -> None:
     """Catches a pattern that is ignored: all other joints stay rigid."""
     stiff = np.where(np.isin(JOINTS, ["elbow", "wrist_pitch"]), K, 1e12)

@@ -8,10 +8,10 @@ import mujoco
 import numpy as np
 
 from baselines.compensation.position_compensator import PositionCompensator
-from elastic_env.core.errors import ConfigurationError, require_known
+from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
 from elastic_env.joint.supported_models import held_positions
-from elastic_env.rigid.tree.end_effector import EndEffector, outermost_body
+from elastic_env.rigid.tree.end_effector import EndEffector, outermost_body, site_or_body
 from elastic_env.world.robot_model import joint_ranges
 
 _STEP_RAD = 1e-4  # of central differences: an error of 1e-9 relative
@@ -67,12 +67,12 @@ class StaticArm:
         self._bare = PositionCompensator(model, np.inf, joints=joints).constants.body
         self._loaded = None
         if payload is not None:
-            body, place = place_of(model, payload)
+            body, place, _ = site_or_body(model, payload)
             loaded = PositionCompensator(model, np.inf, joints=joints)
             loaded.set_payload(1.0, place, model.body(body).name)
             self._loaded = loaded.constants.body
         if end_effector is not None:
-            place_of(model, end_effector)  # a name is checked although not all logs need it
+            site_or_body(model, end_effector)  # a name is checked although not all logs need it
         self._end_effector = end_effector
         self.ranges = np.column_stack(joint_ranges(model, joints))
 
@@ -116,14 +116,3 @@ class StaticArm:
     def attitude(self, q: Array) -> Attitude:
         """Poses of the end effector, (N, n) [rad]."""
         return Attitude(*self._tool.pose(q), *self._tool.jacobian(q))
-
-
-def place_of(model: mujoco.MjModel, name: str) -> tuple[int, Array]:
-    """Body of a site or body, and the place of its origin in the body's frame [m]."""
-    sites = [model.site(i).name for i in range(model.nsite)]
-    bodies = [model.body(i).name for i in range(1, model.nbody)]
-    require_known("site or body", [name], [*sites, *bodies])
-    if name in sites:
-        site = model.site(name)
-        return int(site.bodyid[0]), site.pos.copy()
-    return int(model.body(name).id), np.zeros(3)

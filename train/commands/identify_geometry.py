@@ -16,10 +16,10 @@ from baselines.identification.geometry_result import (
 )
 from baselines.identification.holdout import Judged
 from baselines.identification.pose_log import PoseLog
-from baselines.identification.static_arm import place_of
 from elastic_env.core.errors import list_names, unknown_name
 from elastic_env.joint.model_file import read_model
 from elastic_env.joint.supported_models import held_positions
+from elastic_env.rigid.tree.end_effector import site_or_body
 from elastic_env.rigid.tree.links import Tree
 from train.commands.held_out import judge_poses, number_or_dash, show_held_out
 from train.commands.identify_options import ArmOptions, GeometryOptions, IdentificationRun
@@ -81,7 +81,7 @@ def pose_problem(
     names = [end_effector]
     if log.kind == "markers":
         names = [column.removesuffix(".x") for column in log.columns[::3]]
-    markers = [(name, *place_of(model, name)) for name in names]
+    markers = [(name, *site_or_body(model, name)[:2]) for name in names]
     measured = log.measured.reshape(len(log), len(names), 3)
     problem = GeometryProblem(
         model=GeometryModel.of(tree, log.joints, model.opt.gravity, markers),

@@ -71,6 +71,12 @@ class HoldoutOptions(Model):
     folds: int = quantity("1", 1, ge=1, le=20)
     """Hold each pose out once, in so many folds."""
 
+    @model_validator(mode="after")
+    def _folds_hold_out(self) -> Self:
+        if self.folds > 1 and not self.holdout:
+            raise ValueError(f"holdout = 0 holds nothing out, got folds = {self.folds}")
+        return self
+
 
 class GeometryOptions(Model):
     """Poses with markers: what of the geometry is sought together with K."""

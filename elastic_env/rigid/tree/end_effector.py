@@ -9,7 +9,7 @@ import numpy as np
 from mujoco import MjModel
 
 from elastic_env.core.compiled import compile_now
-from elastic_env.core.errors import ConfigurationError, unknown_name
+from elastic_env.core.errors import ConfigurationError, require_known
 from elastic_env.core.signals import Array
 from elastic_env.rigid.tree import kernels
 from elastic_env.rigid.tree.links import Held, Tree
@@ -31,7 +31,7 @@ class EndEffector:
     def __init__(
         self, model: MjModel, joints: Sequence[str], name: str, held: Held | None = None
     ) -> None:
-        self.body, self.place, R = _found(model, name)
+        self.body, self.place, R = site_or_body(model, name, "site or body for end_effector")
         tree = Tree.of(model, joints, held or {})
         self._chain = _chain(tree, self.body)
         if len(self._chain) < 2:
@@ -114,19 +114,21 @@ def outermost_body(model: MjModel) -> str:
     return str(model.body(max(named, key=lambda body: (depth[body], body))).name)
 
 
-def _found(model: MjModel, name: str) -> tuple[int, Array, Array]:
-    """Body of a site or body, place and orientation in it."""
-    sites = {model.site(i).name: i for i in range(model.nsite)}
-    bodies = {model.body(i).name: i for i in range(1, model.nbody)}
-    if name in sites:
-        at = sites[name]
-        R = np.zeros(9)
-        mujoco.mju_quat2Mat(R, model.site_quat[at])
-        return int(model.site_bodyid[at]), model.site_pos[at].copy(), R.reshape(3, 3)
-    if name not in bodies:
-        known = [one for one in (*sites, *bodies) if one]
-        raise unknown_name("site or body for end_effector", name, known)
-    return bodies[name], np.zeros(3), np.eye(3)
+def site_or_body(model: MjModel, name: str, kind: str = "site or body") -> tuple[int, Array, Array]:
+    """Body of a site or body; place of its origin [m] and orientation in that body.
+
+    Raises:
+        ConfigurationError: There is none of that name.
+    """
+    sites = [model.site(i).name for i in range(model.nsite)]
+    bodies = [model.body(i).name for i in range(1, model.nbody)]
+    require_known(kind, [name], [one for one in (*sites, *bodies) if one])
+    if name not in sites:
+        return int(model.body(name).id), np.zeros(3), np.eye(3)
+    site = model.site(name)
+    R = np.zeros(9)
+    mujoco.mju_quat2Mat(R, site.quat)
+    return int(site.bodyid[0]), site.pos.copy(), R.reshape(3, 3)
 
 
 def _chain(tree: Tree, body: int) -> Any:
