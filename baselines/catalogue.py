@@ -300,7 +300,9 @@ def _with_quick_gains(options: PolicyOptions) -> PolicyOptions:
 
 def _without_mean_error(policy: Any, model: WalkerModel, options: PolicyOptions) -> Any:
     """With a ZMP without a mean error."""
-    gains = options.zmp_offset or ZmpOffsetGains(time_constant_s=_ZMP_OFFSET_S)
+    gains = ZmpOffsetGains(time_constant_s=_ZMP_OFFSET_S)
+    if options.zmp_offset is not None:
+        gains = gains.replace(**options.zmp_offset.model_dump(exclude_unset=True))
     return StandingEstimate(ZmpOffset(policy, model, gains), model, options.standing)
 
 

@@ -112,6 +112,28 @@ def test_on_a_slope_the_mean_error_of_the_zmp_goes() -> None:
     assert (left[False] < 0.5 * left[True]).all()
 
 
+def test_gains_that_are_not_named_keep_the_values_of_the_policy() -> None:
+    """Catches the time constant of `adaptive_posture` in `foothold`, whose own is 23 s."""
+    env = vector("slope")
+    given = (
+        {"limit_m": 0.02},
+        {"limit_m": 0.02, "time_constant_s": 23.0},
+        {"limit_m": 0.02, "time_constant_s": 6.0},
+    )
+    policies = [baselines.make("foothold", env, zmp_offset=gains) for gains in given]
+    states: list[Any] = [None] * 3
+    observation, _ = env.reset(seed=3)
+    for _ in range(400):
+        moves = [
+            policy.predict(observation, state)
+            for policy, state in zip(policies, states, strict=True)
+        ]
+        states = [state for _, state in moves]
+        observation, *_ = env.step(moves[0][0])
+    np.testing.assert_array_equal(moves[0][0], moves[1][0])
+    assert not np.array_equal(moves[0][0], moves[2][0])
+
+
 def test_policies_without_posture_feedback_have_none() -> None:
     """Catches an option that is taken and has no effect."""
     with pytest.raises(ConfigurationError, match="zmp_offset"):
