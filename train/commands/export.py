@@ -180,7 +180,8 @@ class Onnx(Output):
 
     Example: elastic export onnx residual:testbed/seed_0 -o testbed.onnx
 
-    Example, of a robot of your own: elastic export onnx residual:runs/mine/seed_0/last --env arm.yaml
+    Example, of a robot of your own: elastic export onnx residual:runs/mine/seed_0/last
+        --env arm.yaml
     """
 
     residual: Annotated[Locator, tyro.conf.Positional]
