@@ -74,7 +74,8 @@ class HoldoutOptions(Model):
     @model_validator(mode="after")
     def _folds_hold_out(self) -> Self:
         if self.folds > 1 and not self.holdout:
-            raise ValueError(f"holdout = 0 holds nothing out, got folds = {self.folds}")
+            cure = "leave folds at 1, or give holdout a share > 0"
+            raise ValueError(f"holdout = 0 holds nothing out, got folds = {self.folds}; {cure}")
         return self
 
 

@@ -115,7 +115,12 @@ def outermost_body(model: MjModel) -> str:
 
 
 def site_or_body(model: MjModel, name: str, kind: str = "site or body") -> tuple[int, Array, Array]:
-    """Body of a site or body; place of its origin [m] and orientation in that body.
+    """Body of a site or body; place (3,) [m] and orientation (3, 3) of its frame in that body.
+
+    Args:
+        model: Compiled model.
+        name: Of the site, or else of the body.
+        kind: What the name should have named, for the error.
 
     Raises:
         ConfigurationError: There is none of that name.
