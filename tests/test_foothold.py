@@ -30,9 +30,12 @@ def walker(num_envs: int = 1, **options: Any) -> Any:
 
 
 class ClosedLegs:
-    """Feet that land off by a constant, and legs of a compliance between them."""
+    """Feet that land off by a constant, and legs of a compliance between them, whose shear shows
+    less forward the quicker the load comes.
+    """
 
     compliance_m_n = GAINS.compliance_m_n
+    load_rate_m_s = GAINS.load_rate_m_s
     landing_m = LANDING_M
 
     def __init__(self, env: Any, gains: FootholdGains = GAINS) -> None:
@@ -52,11 +55,13 @@ class ClosedLegs:
     def walk(self, bias_n: float = 0.0) -> None:
         """Walk the plan; the force sensor of the left foot is off by a constant."""
         timing = self.plan.timing
+        rate = np.gradient(self.plan.share, self.model.control_period_s)
         state = None
         offset = np.zeros((2, 2))
         for row in range(1, len(timing.time)):
             error = self.place[0] - self.place[1]
-            shear = (error - offset[0] + offset[1]) / self.compliance_m_n
+            hidden = np.array([-self.load_rate_m_s * rate[row], 0.0])
+            shear = (error - offset[0] + offset[1] - hidden) / self.compliance_m_n
             observed = np.zeros((1, len(self.table)))
             wrench = np.zeros((2, 2, 3))
             wrench[0, 0, :2] = shear + bias_n
@@ -104,6 +109,22 @@ def test_a_force_sensor_that_is_off_does_not_let_the_feet_walk_away() -> None:
     assert np.abs(legs.place).max() < 1.1 * wide
 
 
+def test_feet_do_not_walk_forward_by_what_their_shear_hides() -> None:
+    """Catches a rate of the load that is left out, or has the sign of the other foot."""
+    ends = []
+    for load_rate_m_s in (0.0, GAINS.load_rate_m_s):
+        legs = ClosedLegs(walker(num_steps=40), GAINS.replace(load_rate_m_s=load_rate_m_s))
+        legs.walk()
+        ends.append(legs.place.mean(axis=0))
+    share = legs.plan.share
+    shared = (share > 0.25) & (share < 0.75)
+    rate = np.gradient(share, legs.model.control_period_s)[shared]
+    a_step = GAINS.load_rate_m_s * np.abs(rate).mean()
+    assert ends[0][0] == pytest.approx(40 * a_step, rel=0.1)
+    assert abs(ends[1][0]) < 1e-4
+    assert abs(ends[0][1]) < 1e-4
+
+
 def test_an_offset_that_goes_before_the_load_comes_needs_no_true_compliance() -> None:
     """Catches an offset that is still there while the shear is felt.
 
@@ -112,7 +133,9 @@ def test_an_offset_that_goes_before_the_load_comes_needs_no_true_compliance() ->
     """
     drift = []
     for return_load in (1.0, 0.25):
-        legs = ClosedLegs(walker(num_steps=40), GAINS.replace(return_load=return_load))
+        gains = GAINS.replace(return_load=return_load, load_rate_m_s=0.0)
+        legs = ClosedLegs(walker(num_steps=40), gains)
+        legs.load_rate_m_s = 0.0
         legs.compliance_m_n = GAINS.compliance_m_n / 1.25
         legs.landing_m = np.full((2, 2), [0.005, 0.0])
         legs.walk()
