@@ -43,7 +43,8 @@ frame, from landing to landing,
 
 A constant error of e does not add up: left and right take turns, and their signs with them. The
 next swing is offset by −P − b, where P is the place of the foot that stands and b the error with
-which this foot landed before. While the foot takes over the load, its offset goes.
+which this foot landed before. Its offset is gone once it is to carry a quarter of
+the load.
 """
 
 import math
