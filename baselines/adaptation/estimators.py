@@ -104,6 +104,10 @@ class Estimator(Protocol):
     def estimate(self, rows: Array, memory: Any) -> tuple[Array, Any]:
         """The correction r of every joint, (num_worlds, n) [1], and the new memory."""
 
+    def load(self, memory: Any) -> Array | None:  # noqa: ARG002
+        """The mean excess load μ that r has a part for, (num_worlds, 1) [1]; None for none."""
+        return None
+
 
 class EstimatorMemory(NamedTuple):
     """Number and sum of the measured excess loads, (num_worlds, 2), and the observer's memory."""
@@ -135,6 +139,10 @@ class LegEstimator(Estimator):
     def begin(self, num_worlds: int) -> EstimatorMemory:
         loads = np.zeros((num_worlds, 2))
         return EstimatorMemory(loads, self.observer.begin(num_worlds))
+
+    @override
+    def load(self, memory: EstimatorMemory) -> Array:
+        return _mean(memory.loads)
 
     def observe(self, rows: Array, memory: EstimatorMemory) -> tuple[Array, Array, Any]:
         """Values of the observer, the mean excess load, (num_worlds, 1) [1], and new memory."""
@@ -241,6 +249,10 @@ class LegEncoderEstimator(EncoderEstimator):
         return r, EstimatorMemory(loads, observer)
 
     @override
+    def load(self, memory: EstimatorMemory) -> Array:
+        return _mean(memory.loads)
+
+    @override
     def _expected(self, rows: Array, q: Array, friction: Array) -> Array:
         theta = self._view.theta(rows)
         modelled = theta - self._compensator.at(rows).link_angle(theta)
@@ -264,4 +276,8 @@ def mean_load(memory: Array, excess: Array) -> tuple[Array, Array]:
         excess: Measured over assumed load less one, (num_worlds, 1) [1].
     """
     memory = memory + np.hstack([np.ones_like(excess), excess])
-    return memory[:, 1:] / (ASSUMED_LOADS + memory[:, :1]), memory
+    return _mean(memory), memory
+
+
+def _mean(loads: Array) -> Array:
+    return loads[:, 1:] / (ASSUMED_LOADS + loads[:, :1])

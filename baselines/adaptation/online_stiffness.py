@@ -101,6 +101,6 @@ class OnlineStiffness(policies.PolicyAround):
         together = correction
         if inputs.deflection is not None:
             together = (1.0 + correction) * (1.0 + inputs.deflection) - 1.0
-        inputs = inputs._replace(deflection=together)
+        inputs = inputs._replace(deflection=together, load=self.estimator.load(own))
         action, inner = self.policy.act(rows, memory.inner, inputs)
         return action, StiffnessMemory(wait, target, correction, own, inner)

@@ -115,6 +115,8 @@ class Compensator(Protocol):
     """1 where its link angles follow from the model, 0 where sensors show them; a number, or
     (n,) [1].
     """
+    weighs: bool = False
+    """Its link angles show a load that no model knows."""
 
     @abstractmethod
     def at(self, rows: Array) -> "Compensator":
@@ -170,7 +172,8 @@ class GravityCompensator(Compensator):
         """τ_g of the desired posture."""
         self._load: Any = self.gravity  # of the measured posture
         self.output = output
-        if output == "wrench":
+        self.weighs = output == "wrench"
+        if self.weighs:
             if not isinstance(model, WalkerModel):
                 raise ConfigurationError(
                     "the output compensator 'wrench' needs a walker with force-torque sensors at"
@@ -214,7 +217,7 @@ class GravityCompensator(Compensator):
 
     def deflection_by_tilt(self, theta: Array) -> Parameter:
         """What the measured tilt of a walker's pelvis adds to Eq. 12, (num_worlds, n) [rad]."""
-        if self._load is self.gravity or self.output == "wrench":
+        if self._load is self.gravity or self.weighs:
             return 0.0
         tilted = self._load.solve(theta, self.stiffness)
         return tilted - self.gravity.solve(theta, self.stiffness)
@@ -275,7 +278,7 @@ class DynamicCompensator(Compensator):
         is_walker = isinstance(model, WalkerModel)  # whose planned motion alone is known
         gravity = self._static.gravity
         self._body: Any = PlannedTorque(model, gravity) if is_walker else make_gravity(model)
-        self._measures = output == "wrench"
+        self.weighs = output == "wrench"
         self._dt = model.control_period_s
         self._stiffness = model.stiffness[None]
         self._backlash: Parameter = model.backlash if model.backlash.any() else 0.0
@@ -359,7 +362,7 @@ class DynamicCompensator(Compensator):
 
         The tilt of a walker's pelvis, which is not desired, adds what it bends at rest.
         """
-        if self._measures:
+        if self.weighs:
             return self._static.link_angle(theta)
         return theta - memory.deflection - self._static.deflection_by_tilt(theta)
 
@@ -514,6 +517,7 @@ class Compensated(PolicyAround):
     def act(self, rows: Array, memory: CompensatedMemory, inputs: PolicyInputs) -> Step:
         """It takes the input `deflection`, r: what is compensated, and seen, is (1 + r) δ.
 
+        What torque sensors or foot wrenches show of an unknown load is not in r a second time.
         The contact forces that load the joints act where the inputs shift the ZMP.
         """
         correction = inputs.deflection
@@ -528,15 +532,18 @@ class Compensated(PolicyAround):
         theta = rows[:, self._theta]
         links = compensator.link_angle(theta, own)
         if correction is not None:
-            links = links - compensator.modelled * correction * (theta - links)
+            seen = correction
+            if inputs.load is not None and compensator.weighs:
+                seen = (1.0 + correction) / (1.0 + inputs.load) - 1.0
+            links = links - compensator.modelled * seen * (theta - links)
             if not self._corrects_policy:
                 inputs = inputs._replace(deflection=None)
-        seen = rows.copy()
-        seen[:, self._theta] = links
+        shown = rows.copy()
+        shown[:, self._theta] = links
         if self.policy.reads_rates:
             rates = compensator.link_rate(theta, rows[:, self._theta_dot])
-            seen[:, self._theta_dot] = rates
-        action, inner = self.policy.act(seen, memory.inner, inputs)
+            shown[:, self._theta_dot] = rates
+        action, inner = self.policy.act(shown, memory.inner, inputs)
         wanted = action.astype(np.float64)
         motion = self.view.motion(rows)
         desired = Motion(motion.q + wanted, motion.q_dot, motion.q_ddot)

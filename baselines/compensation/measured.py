@@ -106,6 +106,7 @@ class MeasuredCompensator(DynamicCompensator):
         super().__init__(model, output, method)
         self._sensors = sensors
         self.modelled = sensors.modelled
+        self.weighs = self.weighs or sensors.are_torques
         self._measures_all = bool(sensors.has.all())
         self._deflection: Array = np.zeros(len(model.joint_names))
 

@@ -48,11 +48,13 @@ class PolicyInputs(NamedTuple):
     """Values of a policy's inputs, (num_worlds, columns) each; None for one that is not used.
 
     A policy takes what is its own and passes on the rest. `baselines.compensation.inputs` says what
-    each input is. `command` is no field: it is added to whatever a policy commands. The last two
-    fields tell a policy of a user how `predict` was called.
+    each input is. `command` is no field: it is added to whatever a policy commands. `load` is no
+    input: it says what part of `deflection` a load has, μ [1]. The last two fields tell a policy of
+    a user how `predict` was called.
     """
 
     deflection: Array | None = None
+    load: Array | None = None
     zmp: Array | None = None
     com: Array | None = None
     leg_length: Array | None = None
