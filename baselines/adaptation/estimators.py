@@ -280,4 +280,5 @@ def mean_load(memory: Array, excess: Array) -> tuple[Array, Array]:
 
 
 def _mean(loads: Array) -> Array:
+    """Mean excess load, (num_worlds, 1) [1], of number and sum, (num_worlds, 2)."""
     return loads[:, 1:] / (ASSUMED_LOADS + loads[:, :1])

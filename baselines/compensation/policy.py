@@ -49,8 +49,8 @@ class PolicyInputs(NamedTuple):
 
     A policy takes what is its own and passes on the rest. `baselines.compensation.inputs` says what
     each input is. `command` is no field: it is added to whatever a policy commands. `load` is no
-    input: it says what part of `deflection` a load has, μ [1]. The last two fields tell a policy of
-    a user how `predict` was called.
+    input: it is the mean excess load μ that `deflection` has a part for, (num_worlds, 1) [1]. The
+    last two fields tell a policy of a user how `predict` was called.
     """
 
     deflection: Array | None = None

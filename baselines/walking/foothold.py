@@ -43,8 +43,8 @@ frame, from landing to landing,
 
 A constant error of e does not add up: left and right take turns, and their signs with them. The
 next swing is offset by −P − b, where P is the place of the foot that stands and b the error with
-which this foot landed before. Its offset is gone once it is to carry a quarter of
-the load.
+which this foot landed before. The offset is gone once the foot is to carry a quarter of the load
+(`return_load`).
 """
 
 import math
