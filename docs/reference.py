@@ -27,11 +27,12 @@ from elastic_env.core.config import Model
 from elastic_env.core.robot_ranges import RobotRanges
 from elastic_env.core.signals import Signal
 from elastic_env.hardware.arm_settings import ArmSettings, ServoPlace
-from elastic_env.hardware.settings import HardwareSettings, SafetyLimits
+from elastic_env.hardware.settings import SafetyLimits
 from elastic_env.world.scenario import DISTRIBUTIONS, RANGES_BEYOND, TRAINING_RANGES, scenario_names
 from train.commands.bench import BenchCase, BenchConfig
 from train.commands.cli import COMMANDS, main
 from train.commands.compare import CompareConfig
+from train.commands.options import Mounting
 from train.evaluate.conditions import PolicySpec
 from train.learn.algorithm_options import MODELS
 from train.learn.train_config import TrainConfig
@@ -186,7 +187,7 @@ def mountings_page() -> str:
     )
     testbed, arm = "A file of the testbed", "A file of an arm"
     parts = [
-        _model(HardwareSettings, testbed),
+        _model(Mounting, testbed),
         _model(SafetyLimits, "limits"),
         _model(ArmSettings, arm),
         _model(ServoPlace, "joints"),

@@ -81,7 +81,7 @@ def configure_robot(
             the model's first keyframe, or its reference, within the joint ranges, or near there
             where the servos hold it.
         load_kg: The scenario `payload` adds a fifth of this mass at the end effector [kg]; default
-            the mass that the joints carry.
+            the mass of the model, its base included.
         imu: Site of the accelerometer.
         stiffness: K in place of that in `joints` [N·m/rad], one number or one per joint.
         form: "tendon" for elastic joints, "rigid" for what an inelastic robot would do.
