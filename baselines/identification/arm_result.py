@@ -88,10 +88,6 @@ class ArmIdentification(Model):
     held_out: HeldOut | None = None
     """Errors at poses that another fit did not see; None where there are none."""
 
-    def stiffness(self) -> dict[str, dict[str, float]]:
-        """A mapping as `PositionCompensator` and the environments take it."""
-        return {joint.joint: {"stiffness": _written(joint)} for joint in self.joints}
-
     def save(self, folder: Path) -> list[Path]:
         """Write `identification.json` and `joints.yaml`."""
         files = [folder / "identification.json", folder / "joints.yaml"]

@@ -4,7 +4,6 @@ import math
 from pathlib import Path
 
 import mujoco
-import numpy as np
 from pydantic import Field
 
 from baselines.identification.geometry_fit import GeometryEstimate, GeometryFit
@@ -12,7 +11,7 @@ from baselines.identification.geometry_model import Geometry, rotation_of
 from baselines.identification.holdout import HeldOut
 from elastic_env.core.config import Model
 from elastic_env.core.errors import ConfigurationError
-from elastic_env.core.signals import Array
+from elastic_env.core.rotations import matrix_of, quaternion_of
 from elastic_env.core.yaml_text import yaml_line
 from elastic_env.rigid.tree.links import Tree
 
@@ -51,22 +50,13 @@ class GeometryIdentification(Model):
             if not parameter.is_told
         )
 
-    def stiffness(self) -> dict[str, dict[str, float]]:
-        """A mapping as `PositionCompensator` and the environments take it."""
-        return {
-            joint.joint: {"stiffness": float(f"{joint.stiffness_nm_per_rad:.6g}")}
-            for joint in self.joints
-        }
-
     def save(self, folder: Path, model: mujoco.MjSpec) -> list[Path]:
         """Write `identification.json`, `joints.yaml` and `model.xml`."""
         files = [folder / name for name in ("identification.json", "joints.yaml", "model.xml")]
         files[0].write_text(self.model_dump_json(indent=2) + "\n", encoding="utf-8")
         head = "# stiffness [N·m/rad], by elastic identify --geometry; .inf for a rigid joint"
-        lines = [
-            yaml_line(joint.joint, self.stiffness()[joint.joint], _interval(joint))
-            for joint in self.joints
-        ]
+        known = [(joint, float(f"{joint.stiffness_nm_per_rad:.6g}")) for joint in self.joints]
+        lines = [yaml_line(joint.joint, {"stiffness": K}, _interval(joint)) for joint, K in known]
         files[1].write_text("\n".join([head, *lines]) + "\n", encoding="utf-8")
         files[2].write_text(model.to_xml(), encoding="utf-8")
         return files
@@ -127,7 +117,7 @@ def correct_model(spec: mujoco.MjSpec, tree: Tree, fit: GeometryFit) -> mujoco.M
         if own.frame is not None:  # the pose is in the parent, whatever frame it was written in
             own.set_frame(own.parent.add_frame())
         own.pos = anchor + shift + turn @ (model.body_pos[body] - anchor)
-        own.quat = _quaternion(turn @ _matrix(model.body_quat[body]))
+        own.quat = quaternion_of(turn @ matrix_of(model.body_quat[body]))
         own.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
     return corrected
 
@@ -153,15 +143,3 @@ def _interval(joint: JointCompliance) -> str:
     high = joint.stiffness_high_nm_per_rad
     upper = "rigid" if high is None else f"{high:.4g}"
     return f"{joint.stiffness_low_nm_per_rad:.4g} to {upper}"
-
-
-def _matrix(quaternion: Array) -> Array:
-    flat = np.empty(9)
-    mujoco.mju_quat2Mat(flat, quaternion)
-    return flat.reshape(3, 3)
-
-
-def _quaternion(matrix: Array) -> Array:
-    quaternion = np.empty(4)
-    mujoco.mju_mat2Quat(quaternion, np.ascontiguousarray(matrix).ravel())
-    return quaternion

@@ -2,6 +2,7 @@
 
 import csv
 import errno
+import hashlib
 import os
 import stat
 from pathlib import Path
@@ -40,6 +41,16 @@ def read_rows(table: Path) -> list[dict[str, str]]:
     """Rows of a table of this package, by columns; lines that begin with # are comments."""
     lines = table.read_text(encoding="utf-8").splitlines()
     return list(csv.DictReader(line for line in lines if not line.startswith("#")))
+
+
+def digest_of(path: Path) -> str:
+    """SHA-256 of a file, in hexadecimal digits.
+
+    Raises:
+        OSError: It is missing or cannot be read.
+    """
+    with path.open("rb") as content:
+        return hashlib.file_digest(content, "sha256").hexdigest()
 
 
 def leads_out(path: Path, folder: Path) -> bool:

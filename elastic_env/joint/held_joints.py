@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 from mujoco import MjModel, MjsBody, MjSpec
 
+from elastic_env.core.rotations import matrix_of, quaternion_of
 from elastic_env.core.signals import Array
 from elastic_env.joint.model_file import compiled_spec
 from elastic_env.joint.supported_models import home_of, require_known_torque
@@ -50,7 +51,7 @@ def _put_bodies_in_place(
         own = range(model.body_jntadr[b], model.body_jntadr[b] + model.body_jntnum[b])
         if all(model.joint(j).name in joints for j in own):
             continue
-        R = _matrix(model.body_quat[b])
+        R = matrix_of(model.body_quat[b])
         p = model.body_pos[b].copy()
         before: list[int] = []
         for j in own:
@@ -72,10 +73,8 @@ def _place(body: MjsBody, R: Array, p: Array) -> None:
     """Give a body a pose in its parent, whatever frames it was written in."""
     body.set_frame(body.parent.add_frame())
     body.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
-    quaternion = np.zeros(4)
-    mujoco.mju_mat2Quat(quaternion, R.ravel())
     body.pos = p
-    body.quat = quaternion
+    body.quat = quaternion_of(R)
 
 
 def _displacement(model: MjModel, joint: int, home: Array) -> tuple[Array, Array]:
@@ -88,11 +87,5 @@ def _displacement(model: MjModel, joint: int, home: Array) -> tuple[Array, Array
         return np.eye(3), way * axis
     quaternion = np.zeros(4)
     mujoco.mju_axisAngle2Quat(quaternion, axis, way)
-    R = _matrix(quaternion)
+    R = matrix_of(quaternion)
     return R, anchor - R @ anchor
-
-
-def _matrix(quaternion: Array) -> Array:
-    matrix = np.zeros(9)
-    mujoco.mju_quat2Mat(matrix, quaternion)
-    return matrix.reshape(3, 3)

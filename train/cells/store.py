@@ -26,7 +26,8 @@ from baselines.identification.identify import StaticPoints
 from baselines.policies import is_saved
 from baselines.residual.residual_policy import DESCRIPTION, WEIGHTS, find_folder
 from elastic_env.core.errors import ElasticError, quote
-from elastic_env.core.files import read_bounded, write_whole
+from elastic_env.core.files import digest_of, read_bounded, write_whole
+from elastic_env.joint.model_text import is_file
 from train.evaluate.conditions import Condition
 from train.evaluate.environments import files_of_robot
 from train.evaluate.episodes import Evaluation, episode_labels
@@ -256,7 +257,7 @@ def cell_key(condition: Condition) -> str:
     content = condition.model_dump(mode="json", exclude=_NOT_OF_THE_RESULT)  # type: ignore[arg-type]
     named = condition.model_dump(mode="json", exclude=_LABELS)  # type: ignore[arg-type]
     found = [file for text in _texts(named) for file in named_files(text)]
-    files = {str(file): _file_digest(file) for file in found}
+    files = {str(file): digest_of(file) for file in found}
     whole = {"condition": content, "files": files, "versions": physics()}
     return hashlib.sha256(json.dumps(whole, sort_keys=True).encode()).hexdigest()
 
@@ -265,22 +266,15 @@ def named_files(text: str) -> list[Path]:
     """Files that a text stands for: residual:FOLDER, FILE.py:NAME, module:NAME, or a path."""
     if is_saved(text):
         folder = find_folder(Path(text.partition(":")[2]))
-        return [folder / name for name in _SAVED if _is_file(folder / name)]
+        return [folder / name for name in _SAVED if is_file(folder / name)]
     place, _, name = text.rpartition(":")
     if name.isidentifier():
         source = Path(place) if place.endswith(".py") else _source(place)
         if source is not None:
             return _with_imports(source)
-    if not _is_file(Path(text)):
+    if not is_file(Path(text)):
         return []
-    return [file for file in (Path(text), *files_of_robot(text)) if _is_file(file)]
-
-
-def _is_file(path: Path) -> bool:
-    try:
-        return path.is_file()
-    except (OSError, ValueError):  # text that is no path, such as one that is too long
-        return False
+    return [file for file in (Path(text), *files_of_robot(text)) if is_file(file)]
 
 
 def _source(module: str) -> Path | None:
@@ -304,7 +298,7 @@ def _source(module: str) -> Path | None:
         return Path(origin) if origin.endswith(".py") else None
     for folder in found.submodule_search_locations or ():
         for file in _files_of(Path(folder).joinpath(*parts)):
-            if _is_file(file):
+            if is_file(file):
                 return file
     return None
 
@@ -320,7 +314,7 @@ def _with_imports(file: Path) -> list[Path]:
     waiting = [file]
     while waiting:
         file = waiting.pop()
-        if file in seen or not _is_file(file):
+        if file in seen or not is_file(file):
             continue
         seen.add(file)
         for name in _imports(file):
@@ -350,8 +344,3 @@ def _texts(value: Any) -> Iterator[str]:
     elif isinstance(value, dict | list):
         for part in value.values() if isinstance(value, dict) else value:
             yield from _texts(part)
-
-
-def _file_digest(file: Path) -> str:
-    with file.open("rb") as content:
-        return hashlib.file_digest(content, "sha256").hexdigest()

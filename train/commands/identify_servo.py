@@ -1,6 +1,5 @@
 """`elastic identify --log run.csv`: a servo from logs in time."""
 
-import hashlib
 from collections.abc import Sequence
 from contextlib import suppress
 from functools import partial
@@ -15,6 +14,7 @@ from baselines.identification.servo_load import Load
 from baselines.identification.servo_log import ServoLog, read_servo_log
 from baselines.identification.servo_result import ServoIdentification, describe_servo
 from elastic_env.core.errors import ConfigurationError
+from elastic_env.core.files import digest_of
 from elastic_env.joint.model_file import compiled_model
 from train.commands.held_out import number_or_dash
 from train.commands.identify_options import (
@@ -214,8 +214,7 @@ def _each_once(paths: Sequence[str]) -> dict[str, set[Path | str]]:
         keys: set[Path | str] = {file.resolve()}
         with suppress(OSError):  # the reader says why it cannot be read
             if file.is_file():
-                with file.open("rb") as content:
-                    keys.add(hashlib.file_digest(content, "sha256").hexdigest())
+                keys.add(digest_of(file))
         for other, own in seen.items():
             if keys & own:
                 raise ConfigurationError(f"{other} and {path} are the same log; name each once")

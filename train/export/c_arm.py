@@ -11,13 +11,13 @@ from dataclasses import dataclass
 from hashlib import sha256
 from typing import Any
 
-import mujoco
 import numpy as np
 
 from baselines import PositionCompensator
 from baselines.compensation.dry_friction import PRESLIDING_RAD, FrictionCompensation
 from baselines.compensation.position_compensator import CompensatorConstants
 from elastic_env.core.errors import ElasticError
+from elastic_env.core.rotations import matrix_of
 from elastic_env.core.signals import Array
 from train.export.c_text import (
     GENERATED,
@@ -102,16 +102,16 @@ def payload_frames(constants: CompensatorConstants) -> list[Frame]:
     tree = constants.body.tree
     bodies = [b for b in range(model.nbody) if tree.carrier[b] > 0]
     named = [(b, model.body(b).name) for b in bodies if model.body(b).name]
-    found = [("TIP", constants.tip, np.zeros(3), np.eye(3))]
+    found: list[tuple[str, int, Array, Array]] = [
+        ("TIP", constants.tip, np.zeros(3), np.eye(3)),
+    ]
     found += [(f"BODY_{identifier(name)}", b, np.zeros(3), np.eye(3)) for b, name in named]
     taken = {name for _, name in named}
     for i in range(model.nsite):
         site = model.site(i)
         body = int(site.bodyid[0])
         if body in bodies and site.name and site.name not in taken:
-            R = np.zeros(9)
-            mujoco.mju_quat2Mat(R, site.quat)
-            found.append((f"SITE_{identifier(site.name)}", body, site.pos, R.reshape(3, 3)))
+            found.append((f"SITE_{identifier(site.name)}", body, site.pos, matrix_of(site.quat)))
     names = unique("", [name for name, *_ in found])
     frames: list[Frame] = []
     for name, (_, body, place, R) in zip(names, found, strict=True):

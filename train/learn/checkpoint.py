@@ -5,7 +5,6 @@ digest tells damage from a full disk or a failing one; it is no seal against som
 both.
 """
 
-import hashlib
 import json
 import shutil
 from collections.abc import Iterator
@@ -16,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from elastic_env.core.errors import ElasticError, shorten
-from elastic_env.core.files import flush, read_bounded
+from elastic_env.core.files import digest_of, flush, read_bounded
 from elastic_env.core.json_text import LARGEST_JSON
 from elastic_env.core.signals import Array
 
@@ -102,8 +101,7 @@ def _digests(checkpoint: Path) -> dict[str, str]:
             if (size := file.stat().st_size) > _MOST_BYTES:
                 most = f"at most {_MOST_BYTES:.0e} bytes"
                 raise ValueError(f"{shorten(file.name)} must have {most}, not {size:g}")
-            with file.open("rb") as content:
-                found[file.name] = hashlib.file_digest(content, "sha256").hexdigest()
+            found[file.name] = digest_of(file)
     return found
 
 

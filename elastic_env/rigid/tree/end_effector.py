@@ -4,12 +4,12 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-import mujoco
 import numpy as np
 from mujoco import MjModel
 
 from elastic_env.core.compiled import compile_now
 from elastic_env.core.errors import ConfigurationError, require_known
+from elastic_env.core.rotations import matrix_of
 from elastic_env.core.signals import Array
 from elastic_env.rigid.tree import kernels
 from elastic_env.rigid.tree.links import Held, Tree
@@ -131,9 +131,7 @@ def site_or_body(model: MjModel, name: str, kind: str = "site or body") -> tuple
     if name not in sites:
         return int(model.body(name).id), np.zeros(3), np.eye(3)
     site = model.site(name)
-    R = np.zeros(9)
-    mujoco.mju_quat2Mat(R, site.quat)
-    return int(site.bodyid[0]), site.pos.copy(), R.reshape(3, 3)
+    return int(site.bodyid[0]), site.pos.copy(), matrix_of(site.quat)
 
 
 def _chain(tree: Tree, body: int) -> Any:

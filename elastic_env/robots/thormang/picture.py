@@ -11,9 +11,9 @@ plan. Camera and light go with its feet.
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-import mujoco
 import numpy as np
 
+from elastic_env.core.rotations import quaternion_of
 from elastic_env.core.signals import Array
 from elastic_env.motion.gait import LEFT
 from elastic_env.motion.walk_plan import WalkPlan
@@ -198,9 +198,7 @@ class WalkerPicture(Picture):
 
 def _pose(position: Array, R: Array) -> Array:
     """Position and quaternion, (7,)."""
-    quaternion = np.empty(4)
-    mujoco.mju_mat2Quat(quaternion, R.ravel())
-    return np.concatenate([position, quaternion])
+    return np.concatenate([position, quaternion_of(R)])
 
 
 def _phase(now: dict[str, float]) -> str:
