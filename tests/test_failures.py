@@ -282,12 +282,15 @@ def test_an_interrupt_while_modules_load_is_one_word() -> None:
     command = [
         sys.executable,
         "-c",
-        "import sys; sys.argv[1:] = ['demo']; from train.commands.entry import main; main()",
+        "import sys; sys.argv[1:] = ['demo']; from train.commands.entry import main;"
+        " print('begins', flush=True); main()",
     ]
     with subprocess.Popen(
-        command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True
+        command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     ) as program:
-        time.sleep(0.6)
+        assert program.stdout is not None
+        assert program.stdout.readline() == "begins\n"
+        time.sleep(0.2)  # it loads for a second and more
         program.send_signal(signal.SIGINT)
         _, said = program.communicate(timeout=60)
     assert said.splitlines()[-1].endswith("interrupted")
