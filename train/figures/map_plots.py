@@ -26,6 +26,7 @@ _STRONGEST_CHANGE = 1.0
 """Share of a colour in the strongest square, and the change from which on it has that share."""
 _BEST_SHARE = 0.32
 """Share of a policy's colour in a square that it wins."""
+_UNBROKEN = "\N{NO-BREAK SPACE}"
 
 
 Ends = tuple[float, float]
@@ -204,7 +205,8 @@ def _draw_panel(axis: Any, panel: Panel) -> None:
     for side in ("left", "bottom"):
         axis.spines[side].set_visible(False)
     if panel.key:
-        text = "   ".join(f"{letter} {title}" for letter, title, _ in panel.key)
+        entries = (f"{letter} {title}" for letter, title, _ in panel.key)
+        text = "   ".join(entry.replace(" ", _UNBROKEN) for entry in entries)
         place = {"xycoords": "axes fraction", "textcoords": "offset points"}
         below = _wrap(text, 60)
         axis.annotate(below, (0.0, 0.0), (0, -34), fontsize=8, va="top", **place)
