@@ -43,6 +43,14 @@ def read_rows(table: Path) -> list[dict[str, str]]:
     return list(csv.DictReader(line for line in lines if not line.startswith("#")))
 
 
+def is_file(path: str | Path) -> bool:
+    """True if there is a regular file, for any path: one that no file can have is none."""
+    try:
+        return Path(path).is_file()
+    except (OSError, ValueError):
+        return False
+
+
 def digest_of(path: Path) -> str:
     """SHA-256 of a file, in hexadecimal digits.
 

@@ -18,8 +18,9 @@ import numpy as np
 from mujoco import MjModel, MjSpec
 
 from elastic_env.core.errors import ConfigurationError, quote
+from elastic_env.core.files import is_file
 from elastic_env.joint.model_bounds import FOLDERS, require_bounds
-from elastic_env.joint.model_text import LARGEST_BYTES, ModelText, is_file, read_model_text
+from elastic_env.joint.model_text import LARGEST_BYTES, ModelText, read_model_text
 
 GivenModel = str | Path | MjSpec | MjModel
 """A file of MJCF (.xml) or URDF (.urdf), the text of one, a specification, or what MuJoCo

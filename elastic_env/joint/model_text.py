@@ -101,14 +101,6 @@ def without_declaration(text: str) -> str:
     return _DECLARATION.sub("", text.lstrip(_BLANK), count=1)
 
 
-def is_file(path: str | Path) -> bool:
-    """True if there is a regular file, for any path: one that no file can have is none."""
-    try:
-        return Path(path).is_file()
-    except (OSError, ValueError):
-        return False
-
-
 def name_of(path: str | Path) -> str:
     """A path as errors show it: as it is, or shortened and escaped."""
     text = str(path)

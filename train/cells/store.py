@@ -26,8 +26,7 @@ from baselines.identification.identify import StaticPoints
 from baselines.policies import is_saved
 from baselines.residual.residual_policy import DESCRIPTION, WEIGHTS, find_folder
 from elastic_env.core.errors import ElasticError, quote
-from elastic_env.core.files import digest_of, read_bounded, write_whole
-from elastic_env.joint.model_text import is_file
+from elastic_env.core.files import digest_of, is_file, read_bounded, write_whole
 from train.evaluate.conditions import Condition
 from train.evaluate.environments import files_of_robot
 from train.evaluate.episodes import Evaluation, episode_labels

@@ -13,8 +13,8 @@ from baselines import PositionCompensator
 from baselines.residual.settings import RESIDUAL
 from elastic_env.core.config import Locator, Model, Title, quantity
 from elastic_env.core.errors import ConfigurationError, ResultsExistError, shorten
-from elastic_env.core.files import write_whole
-from elastic_env.joint.model_text import is_file, name_of, read_bytes
+from elastic_env.core.files import is_file, write_whole
+from elastic_env.joint.model_text import name_of, read_bytes
 from train.commands.options import StiffnessOrFile, given_options
 from train.export.c_arm import c_header
 from train.export.c_text import c_example, prefix_of, require_prefix

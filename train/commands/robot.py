@@ -20,10 +20,11 @@ from rich.table import Table
 from baselines import PositionCompensator
 from elastic_env.core.config import Locator, Model, read_mapping
 from elastic_env.core.errors import ConfigurationError, ElasticError, quote
+from elastic_env.core.files import is_file
 from elastic_env.core.signals import Array
 from elastic_env.core.yaml_text import yaml_of
 from elastic_env.joint.friction import dry_friction
-from elastic_env.joint.model_text import is_file, is_text, name_of, without_declaration
+from elastic_env.joint.model_text import is_text, name_of, without_declaration
 from elastic_env.motion.arm_references import Poses
 from elastic_env.rendering.picture import Image, with_text
 from elastic_env.rendering.sag import ENLARGED, SagViews
