@@ -42,9 +42,9 @@ _ENVIRONMENTS = (
     "elastic_env.robots.robot",
     "elastic_env.hardware.live",
 )
-"""Packages that say NAME and ID of an environment, and make it in a module `environment`."""
+"""Packages that define NAME and ID of an environment, and make it in a module `environment`."""
 
-_HOMES = {
+_MODULES = {
     "ActionError": "elastic_env.core.errors",
     "ConfigurationError": "elastic_env.core.errors",
     "ElasticError": "elastic_env.core.errors",
@@ -56,27 +56,24 @@ _HOMES = {
     "make_elastic": "elastic_env.joint.make_elastic",
     "small_servo": "elastic_env.joint.small_servos",
 }
-_BESIDE = ("baselines", "train")
-"""Packages that are here by name too: `from elastic_env import baselines`."""
+_PACKAGES = ("baselines", "train")
+"""Packages that `from elastic_env import baselines` gives, too."""
 
 
 def __getattr__(name: str) -> Any:
-    """Public names when they are asked for.
-
-    A process beside the control loop imports this package too.
-    """
-    if name in _BESIDE:
+    """Import a public name at its first use: helper processes of a control loop must start fast."""
+    if name in _PACKAGES:
         return own_package(name)
-    if name not in _HOMES:
+    if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(_HOMES[name]), name)
+    return getattr(import_module(_MODULES[name]), name)
 
 
 prefer_egl()
 IDS: dict[str, str] = {}
 """Gymnasium's ids of the environments by their short names."""
-for _home in _ENVIRONMENTS:
-    _room = import_module(_home)
-    IDS[_room.NAME] = _room.ID
-    _made = f"{_home}.environment:make"
-    gymnasium.register(_room.ID, _made, vector_entry_point=f"{_made}_vector")
+for _name in _ENVIRONMENTS:
+    _package = import_module(_name)
+    IDS[_package.NAME] = _package.ID
+    _entry_point = f"{_name}.environment:make"
+    gymnasium.register(_package.ID, _entry_point, vector_entry_point=f"{_entry_point}_vector")

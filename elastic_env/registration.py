@@ -18,19 +18,19 @@ from elastic_env.world.envs import ElasticEnv, ElasticVectorEnv
 from elastic_env.world.task import Task
 
 BACKENDS = ("mujoco", "warp")
-"""What can step the physics of a vector environment."""
+"""Engines that step the physics of a vector environment."""
 _LEAST_WORLD_BYTES = 10_000
-"""Memory of a world: measured on the testbed, the smallest robot, without a policy."""
+"""Memory of a world, measured on the testbed without a policy: the smallest robot [bytes]."""
 
 
 @dataclass(frozen=True)
 class Robot:
-    """A robot, or a robot and what it does, as an environment.
+    """A robot with its task, as an environment.
 
     Attributes:
         name: Short name.
-        id: Of Gymnasium, such as elastic_env/Testbed-v0.
-        configure: Makes a configuration of the arguments of `gymnasium.make`.
+        id: Id in Gymnasium, such as elastic_env/Testbed-v0.
+        configure: Makes the configuration from the arguments of `gymnasium.make`.
         task: Makes the rules from a configuration and a number of worlds.
         picture: Makes the picture of a task.
     """
@@ -42,8 +42,8 @@ class Robot:
     picture: Callable[[Any], Picture]
 
     def make(self, render_mode: str | None = None, **arguments: Any) -> ElasticEnv:
-        """Entry point; arguments as in `configure`."""
-        task = self.task(self._configured(arguments), 1)
+        """Make one environment, Gymnasium's entry point; arguments as in `configure`."""
+        task = self.task(self._configuration(arguments), 1)
         return ElasticEnv(task, render_mode, partial(self.picture, task))
 
     def make_vector(
@@ -56,21 +56,22 @@ class Robot:
         device: str | None = None,
         **arguments: Any,
     ) -> ElasticVectorEnv:
-        """Vector entry point; further arguments as in `configure`.
+        """Make many worlds, Gymnasium's vector entry point; further arguments as in `configure`.
 
         Args:
-            num_envs: Worlds.
+            num_envs: Number of worlds.
             num_threads: Threads of the physics and the control step, 0 for all cores.
             autoreset_mode: Gymnasium's `AutoresetMode` or its value.
             render_mode: "rgb_array" or None.
-            backend: What steps the physics: "mujoco", or "warp" for MuJoCo Warp on a GPU, which
+            backend: Engine of the physics: "mujoco", or "warp" for MuJoCo Warp on a GPU, which
                 needs the extra `gpu`.
-            device: Of the backend "warp": "cuda:0", the default, another GPU, or "cpu" for tests.
+            device: Device of the backend "warp": "cuda:0", the default, another GPU, or "cpu" for
+                tests.
             **arguments: As in `configure`.
 
         Raises:
-            ConfigurationError: A number of worlds or threads that cannot be, worlds beyond the
-                memory, or a backend or device that is not there.
+            ConfigurationError: The number of worlds or threads is invalid, the worlds exceed the
+                memory, or the backend or device does not exist.
         """
         all_threads = ", 0 for all"
         bounds = [("num_envs", num_envs, 1, ""), ("num_threads", num_threads, 0, all_threads)]
@@ -86,7 +87,7 @@ class Robot:
                 f'device = {quote(device)} needs backend="warp"; the backend "mujoco" runs on the'
                 " processor"
             )
-        task = self.task(self._configured(arguments), num_envs)
+        task = self.task(self._configuration(arguments), num_envs)
         picture = partial(self.picture, task)
         simulation = None
         if backend == "warp":
@@ -103,45 +104,45 @@ class Robot:
         )
 
     def register(self) -> None:
-        """Make the id known to Gymnasium; a second time changes nothing."""
+        """Register the id with Gymnasium; a second call changes nothing."""
         if self.id not in gymnasium.registry:
             gymnasium.register(
                 id=self.id, entry_point=self.make, vector_entry_point=self.make_vector
             )
 
-    def _configured(self, arguments: dict[str, Any]) -> Any:
+    def _configuration(self, arguments: dict[str, Any]) -> Any:
         known = inspect.signature(self.configure).parameters
         require_known(f"argument of {self.id}", arguments, known)
         return self.configure(**arguments)
 
 
-def as_model(name: str, given: ModelT | dict[str, Any] | None, default: ModelT) -> ModelT:
-    """An argument that is a model, a mapping of what differs from the default, or left out.
+def as_model(name: str, value: ModelT | dict[str, Any] | None, default: ModelT) -> ModelT:
+    """Return the model of an argument: a model, a mapping of changes to the default, or None.
 
     Raises:
-        ConfigurationError: It is none of these.
+        ConfigurationError: The argument is none of these.
     """
-    if not isinstance(given, dict | type(default) | None):
+    if not isinstance(value, dict | type(default) | None):
         needed = f"a {type(default).__name__} or a mapping of its parameters"
-        raise ConfigurationError(f"{name} must be {needed}, got {quote(given)}")
-    return default.replace(**(given or {})) if isinstance(given, dict | None) else given
+        raise ConfigurationError(f"{name} must be {needed}, got {quote(value)}")
+    return default.replace(**(value or {})) if isinstance(value, dict | None) else value
 
 
 def require_memory(name: str, worlds: int, world_bytes: int) -> None:
     """Refuse more worlds than the memory holds.
 
     Args:
-        name: Parameter that says how many.
-        worlds: How many.
+        name: Parameter that sets the number of worlds.
+        worlds: Number of worlds.
         world_bytes: Memory of each [bytes].
 
     Raises:
         ConfigurationError: They do not fit.
     """
     needed = int(worlds) * world_bytes
-    there = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    if needed > there:
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    if needed > memory:
         raise ConfigurationError(
             f"{quote(worlds)} worlds take about {quote(needed // 10**9)} GB of memory, this"
-            f" computer has {there / 1e9:.1f} GB; set {name} to at most {there // world_bytes}"
+            f" computer has {memory / 1e9:.1f} GB; set {name} to at most {memory // world_bytes}"
         )

@@ -158,9 +158,9 @@ def test_every_quantity_begins_at_the_scenario_itself() -> None:
     """Catches a first value that is a change already, and one that no scenario can have."""
     plain = make_scenario("spread")
     for own in QUANTITIES:
-        assert own.harmless == plain.fixed(own.field)
+        assert own.harmless == plain.fixed_value(own.field)
         middle = (own.harmless + own.fatal) / 2.0
-        assert plain.replace(**{own.field: middle}).fixed(own.field) == middle
+        assert plain.replace(**{own.field: middle}).fixed_value(own.field) == middle
 
 
 @pytest.mark.slow

@@ -285,8 +285,8 @@ def test_a_number_is_an_interval_of_one_point_that_every_robot_has() -> None:
         assert robot.homing_rad == (0.1, 0.1)
         assert robot.load_kg == 5.0
         assert set(robot.cross_talk) == {-0.3}
-    assert make_scenario("soft").fixed("stiffness") == 0.7
-    assert make_scenario("drawn").fixed("stiffness") == 1.0
+    assert make_scenario("soft").fixed_value("stiffness") == 0.7
+    assert make_scenario("drawn").fixed_value("stiffness") == 1.0
     with pytest.raises(ModelError, match="stiffness"):
         RobotRanges(stiffness=True)
 
@@ -657,7 +657,7 @@ def test_a_joint_on_a_fixed_base_is_what_was_drawn(num_envs: int) -> None:
     plain = env.task.model
     springs = [plain.tendon("joint_spring").id]
     link = plain.joint("joint").dofadr[0]
-    ranges = TRAINING_RANGES.on_fixed_base()
+    ranges = TRAINING_RANGES.without_walker_fields()
     for world in range(num_envs):
         robot = robot_of(env, world)
         assert is_within(ranges, robot)

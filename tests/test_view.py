@@ -46,7 +46,7 @@ def walker() -> Any:
 
 def posed(picture: Any, now: Any, factor: float) -> tuple[SideBySide, mujoco.MjData]:
     """The three robots in their postures."""
-    scene = SideBySide(picture.alone())
+    scene = SideBySide(picture.display_robot())
     data = mujoco.MjData(scene.model)
     scene.pose(data, picture.sides(now), factor)
     mujoco.mj_kinematics(scene.model, data)
@@ -74,7 +74,7 @@ def test_the_motor_side_is_what_the_encoders_say(walker: Any) -> None:
     scene, data = posed(walker.unwrapped.picture, walker.info, 1.0)
     del scene
     truth = walker.unwrapped.truth()
-    for number, name in enumerate(walker.unwrapped.picture.alone().joints):
+    for number, name in enumerate(walker.unwrapped.picture.display_robot().joints):
         deflection = data.joint(MOTOR + name).qpos - data.joint(LINK + name).qpos
         np.testing.assert_allclose(
             deflection, truth.theta[0, number] - truth.q[0, number], atol=1e-12
@@ -85,7 +85,7 @@ def test_deviations_grow_with_the_factor_and_the_reference_stays(walker: Any) ->
     """Catches a factor that also moves the reference, or that is applied twice."""
     picture = walker.unwrapped.picture
     at = {factor: posed(picture, walker.info, factor)[1] for factor in (0.0, 1.0, 4.0)}
-    for name in picture.alone().joints:
+    for name in picture.display_robot().joints:
         reference = at[1.0].joint(REFERENCE + name).qpos
         for copy in COPIES:
             np.testing.assert_allclose(at[0.0].joint(copy + name).qpos, reference)
@@ -329,6 +329,8 @@ def test_a_robot_of_ones_own_has_sides() -> None:
     scene, data = posed(env.unwrapped.picture, info, 1.0)
     del scene
     truth = env.unwrapped.truth()
-    found = [data.joint(LINK + name).qpos[0] for name in env.unwrapped.picture.alone().joints]
+    found = [
+        data.joint(LINK + name).qpos[0] for name in env.unwrapped.picture.display_robot().joints
+    ]
     np.testing.assert_allclose(found, truth.q[0])
     env.close()

@@ -1,15 +1,15 @@
-"""Functions that Numba compiles: arithmetic row by row.
+"""Decorators for kernels that Numba compiles: arithmetic row by row.
 
 NumPy takes longer, as each of its operations has a fixed cost on small arrays.
 
-Numba compiles them when they are first called with arrays of a kind. It keeps the code beside the
-source file or in the user's cache folder, by the file of the function that was called. So a kernel
-stands in one file with all that it calls, and takes sizes from types, not from constants of other
-files; a test sees to that. Sums run in the order that is written and no operation is fused with
-another. So a row's result does not depend on how many rows there are.
+Numba compiles a kernel at its first call with arrays of a type. It caches the code beside the
+source file or in the user's cache folder, by the file of the called function. So a kernel is in one
+file with all that it calls, and takes sizes from types, not from constants of other files; a test
+checks this. Sums run in the written order, and Numba fuses no operations. So the result of a row
+does not depend on the number of rows.
 
-The logger `elastic_env.core.compiled` says at level INFO that a function of ours is compiled, and
-nothing where it is loaded. So a program can say why its first use takes long.
+The logger `elastic_env.core.compiled` reports at level INFO that a kernel is compiled; it does not
+report one that is loaded. So a program can show why its first use takes long.
 """
 
 import logging
@@ -28,45 +28,46 @@ _P = ParamSpec("_P")
 _R = TypeVar("_R")
 
 _LOG = logging.getLogger(__name__)
-_ONCE = "once after an installation or an update: the first use takes some seconds longer"
-_EVER = "for some seconds in every program: there is no folder to keep it that can be written"
-_said_of: dict[Any, str] = {}
-"""When a function is compiled, by its Python code."""
+_COMPILED_ONCE = "once after an installation or an update: the first use takes some seconds longer"
+_COMPILED_ALWAYS = (
+    "for some seconds in every program: there is no folder to keep it that can be written"
+)
+_notes: dict[Any, str] = {}
+"""How often a function is compiled, by its Python code."""
 
 
 def compiled(function: Callable[_P, _R]) -> Callable[_P, _R]:
-    """Decorate a function of arrays and numbers; its own Python code is the attribute `py_func`."""
-    return _by_numba(function)
+    """Decorate a function of arrays and numbers; `py_func` is its Python code."""
+    return _compile(function)
 
 
 def compiled_part(function: Callable[_P, _R]) -> Callable[_P, _R]:
-    """Decorate what only compiled functions call.
+    """Decorate a function that only compiled functions call.
 
-    Without the code that Python's calls need, all kernels compile in five sixths of the time.
+    It has no entry for Python: so all kernels compile in five sixths of the time.
     """
-    kernel = _by_numba(function, no_cpython_wrapper=True)
+    kernel = _compile(function, no_cpython_wrapper=True)
     return function if kernel is function else _Part(kernel)  # Numba may be switched off
 
 
-def _by_numba(function: Callable[_P, _R], **options: Any) -> Any:
-    # as in NumPy, what is divided by zero is infinite or nan; nobody calls it from C, which saves
-    # some compiling
+def _compile(function: Callable[_P, _R], **options: Any) -> Any:
+    # division by zero gives infinity or nan, as in NumPy; no entry for C saves compile time
     options |= {"error_model": "numpy", "no_cfunc_wrapper": True}
-    _said_of[function] = _ONCE
+    _notes[function] = _COMPILED_ONCE
     try:
         return numba.njit(cache=True, **options)(function)
-    except RuntimeError:  # no folder can be written: every program compiles its own
-        _said_of[function] = _EVER
+    except RuntimeError:  # no folder is writable: every program compiles again
+        _notes[function] = _COMPILED_ALWAYS
         return numba.njit(**options)(function)
 
 
 class _Part(Generic[_P, _R]):
-    """A function that compiled functions call. The first call from Python compiles an entry."""
+    """A function for compiled callers; the first call from Python compiles an entry."""
 
     def __init__(self, kernel: Any) -> None:
         self.py_func = kernel.py_func
         self.kernel = kernel
-        self._numba_type_ = types.Dispatcher(kernel)  # what Numba takes it for
+        self._numba_type_ = types.Dispatcher(kernel)  # Numba calls it as its dispatcher
 
     def __call__(self, *arguments: _P.args, **keywords: _P.kwargs) -> _R:
         return self._entry(*arguments, **keywords)
@@ -78,24 +79,23 @@ class _Part(Generic[_P, _R]):
 
 
 class _Compilations(events.Listener):
-    """Logs that a function of ours is compiled; Numba tells nothing of one that it loads."""
+    """Log the compilation of a kernel; Numba sends no event for one that it loads."""
 
     def on_start(self, event: events.Event) -> None:
-        """A compilation begins, of whatever function."""
         dispatcher = (event.data or {}).get("dispatcher")
-        said = _said_of.get(getattr(dispatcher, "py_func", None))
-        if said is not None:
-            _LOG.info("compiling, %s", said)
+        note = _notes.get(getattr(dispatcher, "py_func", None))
+        if note is not None:
+            _LOG.info("compiling, %s", note)
 
     def on_end(self, event: events.Event) -> None:
-        """It ends."""
+        """Do nothing: the listener must have this method."""
 
 
 events.register("numba:compile", _Compilations())
 
 
 def record_type(**fields: Any) -> np.dtype[Any]:
-    """Type of the rows of a record array for kernels.
+    """Return the type of the rows of a record array for kernels.
 
     Args:
         **fields: Shape of each field of numbers, () for a number.
@@ -105,14 +105,14 @@ def record_type(**fields: Any) -> np.dtype[Any]:
 
 
 def within_compiled(function: Callable[_P, _R]) -> Callable[_P, _R]:
-    """Decorate a formula that kernels compile and Python calls as it is, with NumPy's arrays."""
+    """Decorate a formula that kernels compile, and that Python calls on NumPy arrays as it is."""
     return register_jitable(error_model="numpy")(function)
 
 
 def compile_now(function: Callable[..., Any], *arguments: Any) -> None:
-    """Call a function so that all that it needs is compiled, or loaded, before it is needed.
+    """Call a function, so that its kernels are compiled or loaded in advance.
 
-    This happens in a thread of its own. The compiler calls Python back from C code, where the
+    The call runs in a thread of its own: the compiler calls Python back from C code, where the
     exception of a signal such as Ctrl-C would be lost. The main thread, which gets signals, waits.
     """
 
@@ -120,8 +120,8 @@ def compile_now(function: Callable[..., Any], *arguments: Any) -> None:
         try:
             function(*arguments)
         except OSError:
-            # compiled, and not kept: a full disk costs the next program time
+            # compiled but not cached: a full disk costs the next program time
             function(*arguments)
 
-    with ThreadPoolExecutor(max_workers=1) as beside:
-        beside.submit(call).result()
+    with ThreadPoolExecutor(max_workers=1) as executor:
+        executor.submit(call).result()

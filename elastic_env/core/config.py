@@ -1,8 +1,8 @@
 """Validated, immutable parameter models, and YAML files that become them.
 
-Every parameter of the project is a field of a `Model`: it carries its unit and its bounds, a wrong
-value raises an error that names the field, the unit, the bound and what was given, and an unknown
-key lists the keys that exist.
+Every parameter of the project is a field of a `Model`, with its unit and its bounds. A wrong value
+raises an error that names the field, the unit, the bound and the given value. An unknown key raises
+an error that lists the keys that exist.
 """
 
 import re
@@ -26,7 +26,7 @@ ModelT = TypeVar("ModelT", bound="Model")
 
 
 def quantity(unit: str, default: Any = ..., **bounds: Any) -> Any:
-    """A physical parameter of a `Model`; the docstring below the field is its meaning.
+    """Declare a physical parameter of a `Model`; the docstring below the field is its meaning.
 
     Args:
         unit: SI unit as it appears in error messages and tables, "1" for a pure number.
@@ -37,9 +37,9 @@ def quantity(unit: str, default: Any = ..., **bounds: Any) -> Any:
 
 
 def plain_numbers(value: Any) -> Any:
-    """NumPy's numbers and arrays as Python's numbers and lists, also within containers.
+    """Convert NumPy's numbers and arrays to Python's numbers and lists, also within containers.
 
-    A number of less than double precision becomes what it is written as: 1.6 and not
+    A number of less than double precision becomes its shortest decimal: 1.6 and not
     1.600000023841858.
     """
     match value:
@@ -59,28 +59,27 @@ def plain_numbers(value: Any) -> Any:
             return value
 
 
-def _with_strict_numbers(schema: Any) -> Any:
-    """Pydantic's schema with strict numbers, which may be NumPy's; lists may be arrays."""
+def _strict_schema(schema: Any) -> Any:
+    """Return Pydantic's schema with strict numbers, also NumPy's; arrays count as lists."""
     if isinstance(schema, list | tuple):
-        return type(schema)(_with_strict_numbers(part) for part in schema)
+        return type(schema)(_strict_schema(part) for part in schema)
     if not isinstance(schema, dict) or schema.get("strict"):
         return schema
-    of_values = "default", "expected", "metadata"
-    own: Any = {
-        key: part if key in of_values else _with_strict_numbers(part)
-        for key, part in schema.items()
+    value_keys = "default", "expected", "metadata"
+    strict: Any = {
+        key: part if key in value_keys else _strict_schema(part) for key, part in schema.items()
     }
-    kind = own.get("type")
+    kind = strict.get("type")
     if kind in ("float", "int"):
-        own["strict"] = True
+        strict["strict"] = True
     if kind not in ("float", "int", "list", "tuple"):
-        return own
-    convert = _whole if kind == "int" else plain_numbers
-    return no_info_before_validator_function(convert, own)
+        return strict
+    convert = _to_whole if kind == "int" else plain_numbers
+    return no_info_before_validator_function(convert, strict)
 
 
-def _whole(value: Any) -> Any:
-    """A whole number that is written as 1e3, as one."""
+def _to_whole(value: Any) -> Any:
+    """Convert a whole number that is written as 1e3 to an integer."""
     number = plain_numbers(value)
     return int(number) if isinstance(number, float) and number.is_integer() else number
 
@@ -88,7 +87,7 @@ def _whole(value: Any) -> Any:
 class Model(BaseModel):
     """Base of all parameter models: frozen, no unknown keys, no NaN, errors with unit and bound.
 
-    Numbers are numbers: Python's or NumPy's, and arrays of them, but neither text nor truth values.
+    A number is one of Python or NumPy, also in an array, but neither text nor a truth value.
     """
 
     model_config = ConfigDict(
@@ -107,16 +106,16 @@ class Model(BaseModel):
             raise ModelError(type(self).__name__, problems) from None
 
     def _check(self) -> None:
-        """Refuse parameters that do not go together, by a ValueError."""
+        """Refuse parameters that contradict each other, by a ValueError."""
 
     @model_validator(mode="after")
-    def _go_together(self) -> Self:
+    def _check_together(self) -> Self:
         self._check()
         return self
 
     @classmethod
     def __pydantic_init_subclass__(cls, **kwargs: Any) -> None:
-        """Take the line breaks of docstrings out of descriptions."""
+        """Remove the line breaks of docstrings from descriptions."""
         super().__pydantic_init_subclass__(**kwargs)
         for field in cls.model_fields.values():
             if field.description is not None:
@@ -126,16 +125,16 @@ class Model(BaseModel):
 
     @classmethod
     def __get_pydantic_core_schema__(cls, source: Any, handler: Any) -> CoreSchema:
-        """Pydantic's schema with strict numbers."""
-        return _with_strict_numbers(handler(source))
+        """Return Pydantic's schema with strict numbers."""
+        return _strict_schema(handler(source))
 
     def replace(self, **changes: Any) -> Self:
-        """A validated copy with some parameters changed."""
-        own = {name: getattr(self, name) for name in type(self).model_fields}
-        return type(self)(**{**own, **changes})
+        """Return a validated copy with some parameters changed."""
+        values = {name: getattr(self, name) for name in type(self).model_fields}
+        return type(self)(**{**values, **changes})
 
 
-def _is_text(value: str) -> str:
+def _require_text(value: str) -> str:
     if NO_TEXT.search(value):
         raise ValueError(
             f"a name must hold neither zero bytes nor halves of characters, got {quote(value)}"
@@ -143,7 +142,7 @@ def _is_text(value: str) -> str:
     return value
 
 
-_Text = Annotated[str, AfterValidator(_is_text)]
+_Text = Annotated[str, AfterValidator(_require_text)]
 Title = Annotated[_Text, Field(max_length=100)]
 """Text that names something in tables and files."""
 Locator = Annotated[_Text, Field(max_length=1000)]
@@ -152,21 +151,21 @@ MOST_ENTRIES = 1000
 """Entries of a list in a configuration."""
 
 
-def _each_once(values: list[Any]) -> list[Any]:
+def _require_unique(values: list[Any]) -> list[Any]:
     for value in values:
         if values.count(value) > 1:
             raise ValueError(f"{quote(value)} stands twice; leave out one of them")
     return values
 
 
-Once = AfterValidator(_each_once)
-"""For a list in which nothing stands twice."""
+Once = AfterValidator(_require_unique)
+"""Validator of a list without duplicates."""
 _Entry = TypeVar("_Entry")
 Entries = Annotated[list[_Entry], Field(min_length=1, max_length=MOST_ENTRIES)]
 """A list of a configuration that must not be empty."""
 LARGEST_SEED = 2**63 - 1
 """Seeds of episodes are 64-bit integers."""
-_BYTES = 4
+_BYTES_PER_CHARACTER = 4
 """Most bytes of a character in UTF-8."""
 
 
@@ -177,8 +176,8 @@ def load_yaml(
 
     Args:
         path: The file.
-        model: What it becomes.
-        changes: Parameters in place of the file's, or beside them.
+        model: Class of the result.
+        changes: Parameters that replace the file's or add to them.
 
     Raises:
         ConfigurationError: The file is missing, is not a YAML mapping, or does not fit the model.
@@ -195,12 +194,12 @@ def load_yaml(
 def read_json(
     path: Path, most_bytes: int, missing: Callable[[str], str], within: Path | None = None
 ) -> Any:
-    """Content of a JSON file.
+    """Read a JSON file.
 
     Args:
         path: The file.
-        most_bytes: Largest size.
-        missing: What to say where it cannot be read, for a reason.
+        most_bytes: Largest size [bytes].
+        missing: Makes the message for a file that cannot be read, from the reason.
         within: Folder that the file must lie in, after all links; None for anywhere.
 
     Raises:
@@ -227,16 +226,16 @@ def load_json(
 
     Args:
         path: The file.
-        model: What it becomes.
-        what: What the file describes, such as residual.
-        missing: What to say where it cannot be read, for a reason.
+        model: Class of the result.
+        what: Word for the content, such as residual.
+        missing: Makes the message for a file that cannot be read, from the reason.
         within: Folder that the file must lie in, after all links; None for anywhere.
 
     Raises:
         ConfigurationError: The file cannot be read, is not a JSON mapping, or does not fit the
             model.
     """
-    content = read_json(path, _BYTES * LARGEST_JSON, missing, within)
+    content = read_json(path, _BYTES_PER_CHARACTER * LARGEST_JSON, missing, within)
     if not isinstance(content, dict):
         kind = type(content).__name__
         raise ConfigurationError(f"{shorten(path)} must be a mapping, got {kind}")
@@ -248,17 +247,19 @@ def load_json(
 
 
 def read_mapping(file: Path, empty: bool = False) -> dict[str, Any]:
-    """The mapping that a file of YAML holds.
+    """Read the mapping in a YAML file.
 
     Args:
-        file: It.
-        empty: True to take an empty file, as an empty mapping.
+        file: The file.
+        empty: True to read an empty file as an empty mapping.
 
     Raises:
         ConfigurationError: The file cannot be read, is no YAML, or holds something else.
     """
     try:
-        content = parse_yaml(read_bounded(file, _BYTES * LARGEST_TEXT).decode("utf-8"))
+        content = parse_yaml(
+            read_bounded(file, _BYTES_PER_CHARACTER * LARGEST_TEXT).decode("utf-8")
+        )
     except ConfigurationError:
         raise
     except (yaml.YAMLError, UnicodeDecodeError) as error:
@@ -266,7 +267,7 @@ def read_mapping(file: Path, empty: bool = False) -> dict[str, Any]:
     except IsADirectoryError:
         problem = f"{shorten(file)} is a folder, a YAML file is needed"
     except (FileNotFoundError, NotADirectoryError, ValueError):
-        problem = f"no configuration file at {shorten(file)}{_found_beside(file)}"
+        problem = f"no configuration file at {shorten(file)}{_list_neighbours(file)}"
     except OSError as error:
         problem = f"{shorten(file)} cannot be read: {error.strerror}"
     else:
@@ -280,7 +281,7 @@ def read_mapping(file: Path, empty: bool = False) -> dict[str, Any]:
     raise ConfigurationError(problem) from None
 
 
-def _found_beside(file: Path) -> str:
-    """Files beside one that is not there."""
+def _list_neighbours(file: Path) -> str:
+    """List the YAML files of the folder of a missing file."""
     known = sorted(map(str, file.parent.glob("*.yaml"))) if file.parent.is_dir() else []
     return f"; found beside it: {list_names(known)}" if known else ""

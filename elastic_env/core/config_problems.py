@@ -1,4 +1,4 @@
-"""Sentences about wrong parameters of a model, which name each as its user wrote it."""
+"""Errors about the parameters of a model, which name each parameter as its user wrote it."""
 
 import itertools
 import re
@@ -14,7 +14,7 @@ from elastic_env.core.errors import ConfigurationError, choices_listed, quote, r
 ParameterPath = tuple[str | int, ...]
 """Keys and numbers of entries that lead to a value."""
 Spelling = Callable[[ParameterPath], str]
-"""How a parameter is written."""
+"""Function that writes a parameter as its user did."""
 
 
 @dataclass(frozen=True)
@@ -22,9 +22,9 @@ class Problem:
     """One thing that is wrong with a parameter.
 
     Attributes:
-        path: Where it stands.
-        form: What the sentence says: of a parameter what it must be, of a model a rule that its
-            parameters break, a parameter that it has not, or one that it lacks.
+        path: The parameter.
+        form: "must" for a wrong value, "rule" for parameters that contradict each other, "unknown"
+            for one that does not exist, "missing" for one that has no default.
         text: The rest of the sentence.
     """
 
@@ -32,44 +32,44 @@ class Problem:
     form: Literal["must", "rule", "unknown", "missing"]
     text: str
 
-    def sentence(self, of_all: str, spelt: Spelling) -> str:
-        """The sentence.
+    def sentence(self, root: str, spelling: Spelling) -> str:
+        """Return the sentence.
 
         Args:
-            of_all: Name of the outermost model; empty where its parameters go without.
-            spelt: How a parameter is written.
+            root: Name of the outermost model, as a prefix; empty for none.
+            spelling: Writes a parameter as its user did.
         """
         if self.form in ("must", "rule"):
-            name = spelt(self.path)
-            prefix = f"{of_all}." if of_all and name and self.form == "must" else ""
+            name = spelling(self.path)
+            prefix = f"{root}." if root and name and self.form == "must" else ""
             between = ": " if self.form == "rule" and name else " " if name else ""
             return f"{prefix}{name}{between}{self.text}"
-        owner = spelt(self.path[:-1]) or of_all
-        own = quote(self.path[-1])
+        owner = spelling(self.path[:-1]) or root
+        name = quote(self.path[-1])
         if self.form == "unknown":
             of_owner = f"of {owner} " if owner else ""
-            return f"unknown parameter {of_owner}{own}; {self.text}"
-        return f"{owner or 'the configuration'} needs the parameter {own}{self.text}"
+            return f"unknown parameter {of_owner}{name}; {self.text}"
+        return f"{owner or 'the configuration'} needs the parameter {name}{self.text}"
 
 
-_MOST_SAID = 20
-_LONGEST_SAID = 1900
-"""Problems and characters, after which an error says how many more problems there are."""
+_MOST_SENTENCES = 20
+_LONGEST_MESSAGE = 1900
+"""Sentences and characters of an error; it counts the problems beyond them."""
 
 
 def join_path(path: ParameterPath) -> str:
-    """A parameter as the keys that lead to it."""
+    """Write a parameter as the keys that lead to it, with dots."""
     is_short = [isinstance(part, str) and len(part) < 100 for part in path]
     parts = zip(path, is_short, strict=True)
     return ".".join(str(part) if short else quote(part) for part, short in parts)
 
 
 class ModelError(ConfigurationError):
-    """Parameters that do not fit a model; says all that is wrong with them.
+    """Parameters do not fit a model; the message lists all problems.
 
     Args:
         model: Name of the model.
-        problems: What is wrong.
+        problems: The problems.
     """
 
     def __init__(self, model: str, problems: Sequence[Problem]) -> None:
@@ -78,44 +78,44 @@ class ModelError(ConfigurationError):
         super().__init__(self.describe(model))
 
     def __reduce__(self) -> Any:
-        """What makes it anew in another process."""
+        """Support pickling: another process makes the error from its arguments."""
         return type(self), (self.model, self.problems)
 
-    def describe(self, of_all: str = "", spelt: Spelling = join_path) -> str:
-        """All problems, one per line, for who wrote a file or options.
+    def describe(self, root: str = "", spelling: Spelling = join_path) -> str:
+        """List all problems, one per line, for the author of a file or options.
 
         Arguments as in `Problem.sentence`.
         """
-        found = [problem.sentence(of_all, spelt) for problem in self.problems]
-        sentences = list(dict.fromkeys(map(readable, found)))
+        texts = [problem.sentence(root, spelling) for problem in self.problems]
+        sentences = list(dict.fromkeys(map(readable, texts)))
         lengths = itertools.accumulate(len(sentence) + 1 for sentence in sentences)
-        fitting = max(sum(length <= _LONGEST_SAID for length in lengths), 1)
-        fitting = min(fitting, _MOST_SAID)
-        said = [sentence[:_LONGEST_SAID] for sentence in sentences[:fitting]]
+        fitting = max(sum(length <= _LONGEST_MESSAGE for length in lengths), 1)
+        fitting = min(fitting, _MOST_SENTENCES)
+        lines = [sentence[:_LONGEST_MESSAGE] for sentence in sentences[:fitting]]
         if fitting < len(sentences):
-            said.append(f"and {len(sentences) - fitting} more")
-        return "\n".join(said)
+            lines.append(f"and {len(sentences) - fitting} more")
+        return "\n".join(lines)
 
 
 def problems_of(
     model: type[BaseModel], error: ValidationError, values: Mapping[str, Any]
 ) -> list[Problem]:
-    """Problems that a validation found, those of models within the model among them.
+    """Return the problems of a failed validation, with those of models within the model.
 
     Args:
-        model: What was validated.
-        error: What Pydantic says.
-        values: What was given.
+        model: The model.
+        error: The error of Pydantic.
+        values: The given values.
     """
-    found: list[Problem] = []
+    problems: list[Problem] = []
     for problem in error.errors(include_url=False):
         path = _path(problem["loc"], values, is_missing=problem["type"] == "missing")
         cause = problem.get("ctx", {}).get("error")
         if isinstance(cause, ModelError):  # of a model within this one
-            found += [replace(own, path=(*path, *own.path)) for own in cause.problems]
+            problems += [replace(inner, path=(*path, *inner.path)) for inner in cause.problems]
         else:
-            found.append(_problem(model, path, problem))
-    return found
+            problems.append(_problem(model, path, problem))
+    return problems
 
 
 def _problem(model: type[BaseModel], path: ParameterPath, problem: Any) -> Problem:
@@ -164,11 +164,11 @@ _REQUIREMENTS = {
     "too_long": "have at most {max_length} {entries}",
     "string_too_long": "have at most {max_length} characters",
 }
-"""Requirements in the words of a configuration, where Pydantic's are those of Python."""
+"""Requirements in the words of a configuration; Pydantic's are in those of Python."""
 
 
 def _path(location: ParameterPath, values: Any, is_missing: bool) -> ParameterPath:
-    """A location without what Pydantic adds to it: the member of a union."""
+    """Return a location without the member of a union, which Pydantic adds."""
     path: list[str | int] = []
     for number, part in enumerate(location):
         inside: Any = None
@@ -186,7 +186,7 @@ def _path(location: ParameterPath, values: Any, is_missing: bool) -> ParameterPa
 
 
 def _bounds(field: FieldInfo | None) -> str:
-    """Requirement of a parameter with bounds, such as "a finite number > 0", else empty."""
+    """Return the requirement of bounds, such as "a finite number > 0", or an empty text."""
     if field is None:
         return ""
     signs = {"gt": ">", "ge": ">=", "lt": "<", "le": "<="}
@@ -203,12 +203,12 @@ def _bounds(field: FieldInfo | None) -> str:
 
 
 def _number(bound: float) -> str:
-    """A bound, whole ones with all their digits."""
+    """Write a bound, a whole one with all its digits."""
     return f"{bound:d}" if isinstance(bound, int) else f"{bound:.6g}"
 
 
 def meaning_of(field: FieldInfo) -> str:
-    """The first sentence of a quantity's description, without its unit; empty for another field."""
+    """Return the first sentence of a quantity's description, without unit; else an empty text."""
     if not field.description or not isinstance(field.json_schema_extra, dict):
         return ""
     text = " ".join(field.description.split())

@@ -1,4 +1,4 @@
-"""Tables of numbers from a user's CSV file of bounded size: a header, then finite numbers."""
+"""Reader of a user's CSV file of bounded size: a header, then rows of finite numbers."""
 
 import csv
 import io
@@ -16,9 +16,9 @@ from elastic_env.core.files import read_bounded
 from elastic_env.core.signals import Array
 
 LARGEST_BYTES = 20_000_000
-"""Size of a file."""
+"""Largest size of a file."""
 MOST_COLUMNS = 1000
-"""Columns of a table."""
+"""Largest number of columns."""
 
 _LONGEST_LINE = 200_000
 _CURE = "use commas, and points in numbers"
@@ -26,7 +26,7 @@ _SEPARATORS = {";": "semicolons", "\t": "tabs", "|": "bars"}
 
 
 class Table(NamedTuple):
-    """Numbers under names.
+    """Columns of numbers with names.
 
     Attributes:
         names: Header without spaces around the names, each once, (m,).
@@ -42,14 +42,14 @@ def read_table(file: Path, *, what: str, row: str, most_rows: int, example: str)
 
     Args:
         file: The file.
-        what: Its content in words, such as log.
+        what: Word for its content in messages, such as log.
         row: Word for a row in messages.
-        most_rows: Rows of the table, at most.
-        example: Columns that a header may have, for messages.
+        most_rows: Largest number of rows.
+        example: Columns of a header, for messages.
 
     Raises:
-        ConfigurationError: The file is missing, too large or no CSV file, or holds something else
-            than finite numbers.
+        ConfigurationError: The file is missing, too large or no CSV file, or a value is no finite
+            number.
     """
     try:
         text = read_bounded(file, LARGEST_BYTES).decode("utf-8-sig")
@@ -97,17 +97,17 @@ def _parse(file: Path, text: str, row: str, most_rows: int, example: str) -> Tab
 
 
 def _names(file: Path, header: list[str]) -> tuple[str, ...]:
-    """Names of the columns.
+    """Return the names of the columns.
 
     Raises:
-        ConfigurationError: They are not separated by commas, too many, or not each once.
+        ConfigurationError: They are not separated by commas, too many, empty or not unique.
     """
     names = tuple(cell.strip() for cell in header)
     table = shorten(file)
     name, count = Counter(names).most_common(1)[0]
     problem = None
-    if len(names) == 1 and (called := _separators(header)):
-        problem = f"the columns of {table} are separated by {called}; {_CURE}"
+    if len(names) == 1 and (separator := _separator(header)):
+        problem = f"the columns of {table} are separated by {separator}; {_CURE}"
     elif len(names) > MOST_COLUMNS:
         problem = f"{table} must have at most {MOST_COLUMNS} columns, it has {len(names)}"
     elif "" in names:
@@ -120,11 +120,11 @@ def _names(file: Path, header: list[str]) -> tuple[str, ...]:
 
 
 def _numbers(file: str, where: str, names: tuple[str, ...], cells: list[str]) -> Iterator[float]:
-    """The finite numbers of a row."""
+    """Return the finite numbers of a row."""
     if len(cells) != len(names):
         problem = f"{len(names)} values are needed, one a column, got {len(cells)}"
-        if called := _separators(cells):
-            problem = f"its values are separated by {called}; {_CURE}"
+        if separator := _separator(cells):
+            problem = f"its values are separated by {separator}; {_CURE}"
         elif len(cells) == 2 * len(names):
             problem += "; were its numbers written with decimal commas? Write points"
         raise ConfigurationError(f"{file}, {where}: {problem}")
@@ -134,27 +134,27 @@ def _numbers(file: str, where: str, names: tuple[str, ...], cells: list[str]) ->
             raise ConfigurationError(
                 f"{file} must hold a header and rows of numbers: {where}, column"
                 f" {quote(name)[1:-1]}: a finite number is needed, got {quote(cell)};"
-                f" {_cure_of(cell)}"
+                f" {_cell_cure(cell)}"
             )
         yield value
 
 
-def _separators(cells: list[str]) -> str:
-    """The name of what separates values in place of commas; empty where nothing does."""
+def _separator(cells: list[str]) -> str:
+    """Return the name of another separator than commas; empty where there is none."""
     text = "".join(cells)
     return next((name for mark, name in _SEPARATORS.items() if mark in text), "")
 
 
 def _number(cell: str) -> float:
-    """A cell as a number, nan where it is none."""
+    """Convert a cell to a number, nan where it is none."""
     try:
         return float(cell)
     except ValueError:
         return math.nan
 
 
-def _cure_of(cell: str) -> str:
-    """Cure for a cell that is no finite number."""
+def _cell_cure(cell: str) -> str:
+    """Return the cure for a cell that is no finite number."""
     if math.isnan(_number(cell.replace(",", "."))) and "nan" not in cell.lower():
         return "give a number, or delete the line"
     if "," in cell:

@@ -1,9 +1,9 @@
-"""Numbers that take long to compute, kept on the disk for other processes.
+"""Cache on the disk for numbers that take long to compute, shared by processes.
 
-They stand under a key, the digest of everything that they depend on, so that nothing has to be
-thrown away after a change. A file holds a digest of its key and its numbers, and is checked before
-they are used. What is damaged or missing is computed anew. Files are replaced as a whole: any
-number of processes can read and write them at once.
+The key is the digest of everything that the numbers depend on. So a change needs no deletion. A
+file begins with a digest of its key and its numbers, which is checked at every reading. Damaged or
+missing numbers are computed again. Files are replaced as a whole: any number of processes can read
+and write them at once.
 """
 
 import contextlib
@@ -23,24 +23,24 @@ from elastic_env.core.signals import Array
 
 VARIABLE = "ELASTIC_ENV_CACHE"
 """Environment variable with the folder of all caches, or "off" for none."""
-_OFF = "off"
+_DISABLED = "off"
 _NUMBER = np.dtype("<f8")
 _LOG = logging.getLogger(__name__)
 
 
 def cache_folder() -> Path | None:
-    """The folder of all caches: of `ELASTIC_ENV_CACHE`, or the user's own; None where it is off."""
-    told = os.environ.get(VARIABLE, "")
-    if told:
-        return None if told == _OFF else Path(told)
+    """Return the folder of all caches: `ELASTIC_ENV_CACHE`, or the user's; None where it is off."""
+    setting = os.environ.get(VARIABLE, "")
+    if setting:
+        return None if setting == _DISABLED else Path(setting)
     try:
         home = Path.home()
     except RuntimeError:  # a user without a home
         return None
     if sys.platform == "darwin":
         return home / "Library" / "Caches" / "elastic-env"
-    own = os.environ.get("XDG_CACHE_HOME", "")
-    return (Path(own) if own else home / ".cache") / "elastic-env"
+    base = os.environ.get("XDG_CACHE_HOME", "")
+    return (Path(base) if base else home / ".cache") / "elastic-env"
 
 
 @dataclass(frozen=True)
@@ -48,22 +48,22 @@ class DiskCache:
     """Rows of numbers by their keys, in a folder of their own.
 
     Attributes:
-        name: Of the folder.
-        most_files: Files that stay; the least recently used ones go first.
+        name: Name of the folder.
+        most_files: Largest number of files; the least recently used ones are removed first.
     """
 
     name: str
     most_files: int = 4096
 
     def read(self, key: str, length: int) -> Array | None:
-        """The numbers of a key, (length,); None where they are not there, or are damaged."""
+        """Return the numbers of a key, (length,); None where they are missing or damaged."""
         file = self._file(key)
         if file is None:
             return None
         most = hashlib.sha256().digest_size + length * _NUMBER.itemsize
         try:
             content = read_bounded(file, most)
-            numbers = _unsealed(key, content)
+            numbers = _unseal(key, content)
         except FileNotFoundError:
             return None
         except (OSError, ConfigurationError) as error:
@@ -72,12 +72,12 @@ class DiskCache:
         if numbers is None or len(numbers) != length:
             _LOG.info("%s is not used: it is not what was written", file)
             return None
-        with contextlib.suppress(OSError):  # a folder for reading alone
+        with contextlib.suppress(OSError):  # a read-only folder
             os.utime(file)
         return numbers
 
     def keep(self, key: str, numbers: Array) -> None:
-        """Keep the numbers of a key, (length,); a disk that cannot be written costs time alone."""
+        """Write the numbers of a key, (length,); a disk that refuses costs only time."""
         file = self._file(key)
         if file is None:
             return
@@ -99,23 +99,23 @@ class DiskCache:
             names = [entry.name for entry in entries]
         if len(names) <= self.most_files:
             return
-        by_age = sorted((_used_at(folder / name), name) for name in names)
+        by_age = sorted((_last_use(folder / name), name) for name in names)
         for _, name in by_age[: len(names) - self.most_files * 3 // 4]:
             (folder / name).unlink(missing_ok=True)
 
 
 def key_of(parts: Iterable[bytes | str]) -> str:
-    """SHA-256 digest of everything that numbers depend on, in order."""
-    found = hashlib.sha256()
+    """Return the SHA-256 digest of everything that numbers depend on, in order."""
+    digest = hashlib.sha256()
     for part in parts:
         content = part.encode() if isinstance(part, str) else part
-        found.update(f"{len(content)} ".encode())
-        found.update(content)
-    return found.hexdigest()
+        digest.update(f"{len(content)} ".encode())
+        digest.update(content)
+    return digest.hexdigest()
 
 
-def _unsealed(key: str, sealed: bytes) -> Array | None:
-    """The numbers of a key; None where the content is another one."""
+def _unseal(key: str, sealed: bytes) -> Array | None:
+    """Return the numbers of a file; None where the digest does not fit the key."""
     size = hashlib.sha256().digest_size
     content = sealed[size:]
     if hashlib.sha256(key.encode() + content).digest() != sealed[:size]:
@@ -123,8 +123,8 @@ def _unsealed(key: str, sealed: bytes) -> Array | None:
     return np.frombuffer(content, dtype=_NUMBER).astype(np.float64)
 
 
-def _used_at(file: Path) -> float:
-    """When a file was last used; 0 for one that another process has removed [s]."""
+def _last_use(file: Path) -> float:
+    """Return the time of a file's last use [s]; 0 for one that another process has removed."""
     try:
         return file.stat().st_mtime
     except OSError:

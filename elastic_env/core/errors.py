@@ -1,4 +1,4 @@
-"""Errors that teach: what was required, what was given, and which choices exist."""
+"""Errors that teach: the requirement, the given value, and the choices."""
 
 import difflib
 import itertools
@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 
 from elastic_env.core.installed import install_command
 
-_LONGEST_SHOWN = 200
+_LONGEST_TEXT = 200
 """Characters of a user's text in an error."""
 _LONGEST_LINE = 2000
 _LONGEST_LIST = 1000
@@ -20,10 +20,10 @@ class ElasticError(ValueError):
     """Base of every error that this project raises on purpose.
 
     Attributes:
-        exit_code: What the command `elastic` ends with: 2 for a wrong input, 3 where the system
+        exit_code: Exit status of the command `elastic`: 2 for a wrong input, 3 where the system
             failed.
 
-    A word or a quoted text of more than 200 characters is shortened, since it is a user's.
+    A word or a quoted text of more than 200 characters comes from a user, and is shortened.
     """
 
     exit_code: ClassVar[int] = 2
@@ -40,7 +40,7 @@ class SystemFailedError(ElasticError):
 
 
 class ConfigurationError(ElasticError):
-    """A parameter, a name or a configuration file is not what it has to be."""
+    """A parameter, a name or a configuration file is invalid."""
 
 
 class ActionError(ElasticError):
@@ -56,23 +56,23 @@ class MissingExtraError(ConfigurationError):
 
 
 def missing_extra(package: str, extra: str, purpose: str) -> MissingExtraError:
-    """The error for an optional package that is not there, with the command that installs it."""
+    """Return the error for a missing optional package, with the command that installs it."""
     return MissingExtraError(
         f"{purpose} needs the package {package}; install it with: {install_command(extra)}"
     )
 
 
-class _Shown(reprlib.Repr):
+class _ShortRepr(reprlib.Repr):
     """Short representations, also of integers that Python does not convert to text."""
 
     def __init__(self) -> None:
         super().__init__()
         self.maxlist = self.maxtuple = self.maxdict = self.maxset = 24
-        self.maxstring = self.maxother = self.maxlong = _LONGEST_SHOWN // 2
+        self.maxstring = self.maxother = self.maxlong = _LONGEST_TEXT // 2
         self.maxlevel = 4
 
     def repr_int(self, x: int, level: int) -> str:
-        if abs(x) >= 10**_LONGEST_SHOWN:
+        if abs(x) >= 10**_LONGEST_TEXT:
             return f"a whole number of {x.bit_length()} bits"
         return super().repr_int(x, level)
 
@@ -80,20 +80,20 @@ class _Shown(reprlib.Repr):
         return repr(x) if len(x) <= self.maxstring else super().repr_str(x, level)
 
 
-_SHOWN = _Shown()
+_SHORT_REPR = _ShortRepr()
 
 
 def quote(value: Any) -> str:
-    """A given value as an error shows it: its representation, at most 200 characters."""
-    return shorten(_SHOWN.repr(value))
+    """Return a given value as an error shows it: its representation, at most 200 characters."""
+    return shorten(_SHORT_REPR.repr(value))
 
 
-def shorten(text: object, longest: int = _LONGEST_SHOWN) -> str:
-    """Text of a user as an error shows it without quotes: begin and end of what is long.
+def shorten(text: object, longest: int = _LONGEST_TEXT) -> str:
+    """Return a user's text as an error shows it without quotes: begin and end of a long one.
 
     Args:
-        text: It.
-        longest: Characters that are shown.
+        text: The text.
+        longest: Characters to show.
     """
     whole = str(text)
     if len(whole) <= longest:
@@ -110,23 +110,22 @@ Quotes are paired from the left, so that nothing between two of them counts as o
 
 
 def readable(text: str) -> str:
-    """A message without words, quoted texts or lines that would flood a terminal."""
-    if len(text) <= _LONGEST_SHOWN:
+    """Shorten long words, quoted texts and lines of a message, which would flood a terminal."""
+    if len(text) <= _LONGEST_TEXT:
         return text
-    short = _PIECE.sub(lambda found: shorten(found[0]), text)
+    short = _PIECE.sub(lambda match: shorten(match[0]), text)
     return "\n".join(shorten(line, _LONGEST_LINE) for line in short.split("\n"))
 
 
 def unknown_name(kind: str, name: object, choices: Iterable[str]) -> ConfigurationError:
-    """The error for a name that does not exist, listing those that do.
+    """Return the error for a name that does not exist, with a list of the names that do.
 
     Args:
-        kind: What the name should have named ("scenario", "policy", ...).
-        name: The name that was given.
+        kind: Kind of thing that the name should refer to ("scenario", "policy", ...).
+        name: The given name.
         choices: The names that exist.
     """
-    listed = choices_listed(name, choices)
-    return ConfigurationError(f"unknown {kind} {quote(name)}; {listed}")
+    return ConfigurationError(f"unknown {kind} {quote(name)}; {choices_listed(name, choices)}")
 
 
 def require_known(kind: str, names: Iterable[str], choices: Collection[str]) -> None:
@@ -141,16 +140,16 @@ def require_known(kind: str, names: Iterable[str], choices: Collection[str]) -> 
 
 
 def choices_listed(name: object, choices: Iterable[str]) -> str:
-    """The names that exist, and the one that is closest to what was given."""
+    """List the names that exist, and the one that is closest to a given name."""
     known = list(choices)
-    text = name[:_LONGEST_SHOWN] if isinstance(name, str) else ""
+    text = name[:_LONGEST_TEXT] if isinstance(name, str) else ""
     close = difflib.get_close_matches(text, known, n=1)
     hint = f" Did you mean {quote(close[0])}?" if close else ""
     return f"choose one of: {list_names(known)}.{hint}"
 
 
 def list_names(names: Iterable[object]) -> str:
-    """Names as an error lists them: the first ones, and how many more there are."""
+    """List names as an error does: the first ones, and the number of the others."""
     known = [shorten(name) for name in names]
     lengths = itertools.accumulate(len(name) + 2 for name in known)
     fitting = max(sum(length <= _LONGEST_LIST for length in lengths), 1)

@@ -1,4 +1,4 @@
-"""Files that a user names, read within bounds, and files that are written whole or not at all."""
+"""Files: bounded reading of a user's files, and writing of whole files or nothing."""
 
 import csv
 import errno
@@ -11,17 +11,17 @@ from elastic_env.core.errors import ConfigurationError, quote
 
 
 def read_bounded(path: Path, most_bytes: int, within: Path | None = None) -> bytes:
-    """Content of a plain file, whose kind and size are known before anything of it is read.
+    """Read a plain file after a check of its kind and size.
 
-    A named pipe or a device is never opened, so that nothing waits for ever.
+    A named pipe or a device is never opened: reading it could wait for ever.
 
     Args:
         path: The file.
-        most_bytes: Bytes that it may have.
-        within: Folder that it must lie in, after all links; None for anywhere.
+        most_bytes: Largest size [bytes].
+        within: Folder that must contain the file, after all links; None for anywhere.
 
     Raises:
-        OSError: It is missing or cannot be read.
+        OSError: The file is missing or cannot be read.
         ConfigurationError: It is no plain file, is larger, or leads out of the folder.
     """
     if within is not None and leads_out(path, within):
@@ -32,19 +32,19 @@ def read_bounded(path: Path, most_bytes: int, within: Path | None = None) -> byt
     with os.fdopen(descriptor, "rb") as file:
         _require_plain(path, os.fstat(descriptor), most_bytes)
         content = file.read(most_bytes + 1)
-    if len(content) > most_bytes:  # it grew, or its size is not what the system says
+    if len(content) > most_bytes:  # it has grown, or the system gave a wrong size
         raise _too_large(path, most_bytes, f"more than {most_bytes}")
     return content
 
 
 def read_rows(table: Path) -> list[dict[str, str]]:
-    """Rows of a table of this package, by columns; lines that begin with # are comments."""
+    """Read the rows of a table of this package; lines that begin with # are comments."""
     lines = table.read_text(encoding="utf-8").splitlines()
     return list(csv.DictReader(line for line in lines if not line.startswith("#")))
 
 
 def is_file(path: str | Path) -> bool:
-    """True if there is a regular file, for any path: one that no file can have is none."""
+    """Return True if the path is a regular file, False also for a path that no file can have."""
     try:
         return Path(path).is_file()
     except (OSError, ValueError):
@@ -52,7 +52,7 @@ def is_file(path: str | Path) -> bool:
 
 
 def digest_of(path: Path) -> str:
-    """SHA-256 of a file, in hexadecimal digits.
+    """Return the SHA-256 of a file, in hexadecimal digits.
 
     Raises:
         OSError: It is missing or cannot be read.
@@ -62,18 +62,18 @@ def digest_of(path: Path) -> str:
 
 
 def leads_out(path: Path, folder: Path) -> bool:
-    """True if a path leads out of a folder, after all links of both."""
+    """Return True if a path leads out of a folder, after all links of both."""
     return not Path(os.path.realpath(path)).is_relative_to(os.path.realpath(folder))
 
 
-def _require_plain(path: Path, found: os.stat_result, most_bytes: int) -> None:
-    if stat.S_ISDIR(found.st_mode):
+def _require_plain(path: Path, status: os.stat_result, most_bytes: int) -> None:
+    if stat.S_ISDIR(status.st_mode):
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
-    if not stat.S_ISREG(found.st_mode):
+    if not stat.S_ISREG(status.st_mode):
         problem = "must be a plain file, it is a pipe, a socket or a device"
         raise ConfigurationError(f"{_short_path(path)} {problem}")
-    if found.st_size > most_bytes:
-        raise _too_large(path, most_bytes, str(found.st_size))
+    if status.st_size > most_bytes:
+        raise _too_large(path, most_bytes, str(status.st_size))
 
 
 def _too_large(path: Path, most_bytes: int, has: str) -> ConfigurationError:
@@ -86,31 +86,29 @@ def _short_path(path: Path) -> str:
 
 
 def write_whole(path: Path, content: bytes | str) -> None:
-    """Write a file beside its place and move it there when it is on the disk.
+    """Write a temporary file beside the path, and move it there once it is on the disk.
 
-    A failure leaves nothing new.
-
-    A link at its place is replaced; what it leads to stays as it is.
+    A failure leaves no new file. A link at the path is replaced; its target stays as it is.
 
     Args:
-        path: The file; one that is there is replaced.
+        path: The file; an existing one is replaced.
         content: Its content; text becomes UTF-8.
 
     Raises:
         OSError: The disk is full or the folder cannot be written; it names the file.
     """
-    fresh = path.with_name(f".{path.name}.{os.getpid()}.new")
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.new")
     try:
-        fresh.unlink(missing_ok=True)
+        temporary.unlink(missing_ok=True)
         descriptor = os.open(
-            fresh, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666
+            temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666
         )  # follows no link
         with os.fdopen(descriptor, "wb") as file:
             file.write(content.encode() if isinstance(content, str) else content)
-        flush(fresh)
-        fresh.rename(path)
+        flush(temporary)
+        temporary.rename(path)
     except BaseException as error:
-        fresh.unlink(missing_ok=True)
+        temporary.unlink(missing_ok=True)
         if isinstance(error, OSError):
             error.filename = str(path)
         raise
@@ -118,7 +116,7 @@ def write_whole(path: Path, content: bytes | str) -> None:
 
 
 def flush(path: Path) -> None:
-    """Have a file or folder on the disk before anything that comes later."""
+    """Flush a file or folder to the disk."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)

@@ -1,4 +1,4 @@
-"""JSON that others may have written: of bounded size, with finite numbers and plain text."""
+"""Reader of JSON from any source: of bounded size, with finite numbers and plain text."""
 
 import json
 import math
@@ -11,11 +11,11 @@ LARGEST_JSON = 1_000_000
 
 
 def parse_json(text: str, most: int = LARGEST_JSON) -> Any:
-    """Content of a text in JSON.
+    """Parse a text in JSON.
 
     Args:
         text: The text.
-        most: Characters that it may have.
+        most: Largest number of characters.
 
     Raises:
         ValueError: It is not JSON, is longer or deeper than allowed, or holds a key twice, a
@@ -23,33 +23,31 @@ def parse_json(text: str, most: int = LARGEST_JSON) -> Any:
     """
     if len(text) > most:
         raise ValueError(f"it must have at most {most} characters, got {len(text)}")
-    numbers = {"parse_int": _whole, "parse_float": _real, "parse_constant": _real}
+    numbers = {"parse_int": _to_int, "parse_float": _to_float, "parse_constant": _to_float}
     try:
-        content = json.loads(text, object_pairs_hook=_mapping, **numbers)
+        content = json.loads(text, object_pairs_hook=_to_mapping, **numbers)
     except RecursionError:
         raise _TOO_DEEP from None
     _require_plain(content, 0)
     return content
 
 
-_BOUND = f"at most {DEEPEST_NESTING} deep"
-_TOO_DEEP = ValueError(f"mappings and lists must be nested {_BOUND}")
+_TOO_DEEP = ValueError(f"mappings and lists must be nested at most {DEEPEST_NESTING} deep")
 
 
-def _whole(text: str) -> int:
+def _to_int(text: str) -> int:
     if len(text) > LONGEST_NUMBER:
-        bound = f"at most {LONGEST_NUMBER} characters"
-        raise ValueError(f"a number must have {bound}, got {len(text)}")
+        raise ValueError(f"a number must have at most {LONGEST_NUMBER} characters, got {len(text)}")
     return int(text)
 
 
-def _real(text: str) -> float:
+def _to_float(text: str) -> float:
     if not math.isfinite(value := float(text)):
         raise ValueError(f"numbers must be finite, got {text[:LONGEST_NUMBER]}")
     return value
 
 
-def _mapping(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+def _to_mapping(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     keys = [key for key, _ in pairs]
     if len(set(keys)) < len(keys):
         twice = next(key for key in keys if keys.count(key) > 1)
@@ -58,7 +56,7 @@ def _mapping(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def _require_plain(value: Any, depth: int) -> None:
-    """Refuse values within too many others, and text that no file can hold."""
+    """Refuse values that are nested too deeply, and text that no file can hold."""
     if depth > DEEPEST_NESTING:
         raise _TOO_DEEP
     if isinstance(value, str) and NO_TEXT.search(value):

@@ -1,9 +1,9 @@
-"""What differs on a robot: one closed interval per quantity, and the robots drawn from them.
+"""Differences between robots: one closed interval per quantity, and robots drawn from them.
 
-A number is an interval of one point, which every robot has exactly. A bank of robots is a Latin
-hypercube of the ranges [McKay1979]: every quantity takes one value in each of n intervals of equal
-width, so that few robots cover all of them. Every quantity has generators of its own. So a range
-that is changed leaves the draws of the others as they are.
+A number is an interval of one point: every robot has exactly this value. A bank of robots is a
+Latin hypercube of the ranges [McKay1979]: every quantity takes one value in each of n intervals of
+equal width, so that few robots cover the whole range. Every quantity has generators of its own. So
+a change of one range leaves the draws of the others as they are.
 
 [McKay1979] M. D. McKay, R. J. Beckman, W. J. Conover, "A Comparison of Three Methods for Selecting
 Values of Input Variables in the Analysis of Output from a Computer Code", Technometrics 21(2).
@@ -21,8 +21,8 @@ from elastic_env.core.errors import quote
 from elastic_env.core.signals import Array, BoolArray
 
 
-def _ends(value: Any) -> Any:
-    """A number as the interval of this one point."""
+def _interval_ends(value: Any) -> Any:
+    """Return the ends of an interval; a number is an interval of one point."""
     plain = plain_numbers(value)
     if isinstance(plain, list | tuple):
         return plain
@@ -31,7 +31,7 @@ def _ends(value: Any) -> Any:
     return plain, plain
 
 
-Interval: TypeAlias = Annotated[tuple[float, float], BeforeValidator(_ends)]
+Interval: TypeAlias = Annotated[tuple[float, float], BeforeValidator(_interval_ends)]
 """Lowest and highest value, both included; given as two numbers, or as one for a single point."""
 
 FOOT_ERRORS = (
@@ -43,19 +43,19 @@ FOOT_ERRORS = (
 )
 """Errors of the feet's force-torque sensors, see `elastic_env.world.foot_sensors`."""
 CROSS_TALK_ENTRIES = 30
-"""Of a foot's sensor: six axes on the five others."""
+"""Entries of the matrix of a foot's sensor: six axes on the five others."""
 LOAD_PLACE = ("load_x_m", "load_y_m", "load_z_m")
 """Place of the load from the torso's center of mass."""
-_OF_BOTH_FEET = dict.fromkeys(FOOT_ERRORS, 6) | {"cross_talk": 2 * CROSS_TALK_ENTRIES}
+_FOOT_VALUES = dict.fromkeys(FOOT_ERRORS, 6) | {"cross_talk": 2 * CROSS_TALK_ENTRIES}
 
 
 def interval(unit: str, nominal: float, bounds: Interval) -> Any:
-    """An interval of a `Model`.
+    """Declare an interval of a `Model`.
 
     Args:
         unit: SI unit as it appears in error messages and tables, "1" for a pure number.
-        nominal: Value where nothing is drawn, the default of both ends.
-        bounds: What the ends must lie within.
+        nominal: Value of the assumed robot, the default of both ends.
+        bounds: Lowest and highest value that the ends may have.
     """
     extra: dict[str, Any] = {"unit": unit, "bounds": bounds}
     return Field((nominal, nominal), json_schema_extra=extra)
@@ -68,7 +68,7 @@ _SHOULDERS_M = (0.0056, 0.1595)
 class RobotRanges(Model):
     """Intervals of the quantities in which robots differ from the assumed one; by default none.
 
-    The draws depend on the order of these fields: a new one stands last.
+    The draws depend on the order of these fields: add new ones at the end.
     """
 
     stiffness: Interval = interval("1", 1.0, bounds=(0.05, 20))
@@ -127,30 +127,30 @@ class RobotRanges(Model):
                     f" {highest:g} [{extra['unit']}], got [{low:g}, {high:g}]"
                 )
 
-    def on_fixed_base(self) -> Self:
-        """The same without `WALKER_FIELDS`."""
+    def without_walker_fields(self) -> Self:
+        """Return the ranges with the defaults of `WALKER_FIELDS`."""
         fields = RobotRanges.model_fields
         return self.replace(**{name: fields[name].default for name in WALKER_FIELDS})
 
     def intervals(self) -> Iterator[tuple[str, Interval]]:
-        """Quantities with an interval, by name."""
+        """Yield the quantities with an interval, by name."""
         for name in RobotRanges.model_fields:
             if isinstance(value := getattr(self, name), tuple):
                 yield name, value
 
     @property
     def changes(self) -> list[str]:
-        """Quantities that are not those of the assumed robot."""
+        """Quantities that differ from those of the assumed robot."""
         fields = RobotRanges.model_fields
         return [name for name in fields if getattr(self, name) != fields[name].default]
 
-    def fixed(self, name: str) -> float:
-        """The value of an interval of one point; that of the assumed robot where robots differ."""
+    def fixed_value(self, name: str) -> float:
+        """Return the value of a one-point interval; the assumed robot's where robots differ."""
         default = RobotRanges.model_fields[name].default
         return (default if self.draws(name) else getattr(self, name))[0]
 
     def draws(self, name: str) -> bool:
-        """True if robots differ in a quantity; of a share, if only some robots have it."""
+        """Return True if robots differ in a quantity; for a share, if only some robots have it."""
         value = getattr(self, name)
         return value[0] < value[1] if isinstance(value, tuple) else 0.0 < value < 1.0
 
@@ -163,12 +163,12 @@ class RobotRanges(Model):
 
 _PUSH = ("push_n", "push_share")
 WALKER_FIELDS = ("load_kg", *LOAD_PLACE, "slope_rad", *_PUSH, *FOOT_ERRORS, "floor_friction")
-"""Quantities of `RobotRanges` that only a robot that walks has."""
+"""Quantities of `RobotRanges` that only a walking robot has."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class DrawnRobot:
-    """A value for every quantity of `RobotRanges`, under its name.
+    """A robot: a value for every quantity of `RobotRanges`, under its name.
 
     Attributes:
         stiffness: Factor on K of every joint [1].
@@ -177,9 +177,10 @@ class DrawnRobot:
         slope_direction_rad: Direction in which the floor rises [rad].
         is_delayed: True if measurements are one control step old.
         is_inertial: True if the IMU computes its attitude.
-        force_bias_n, moment_bias_nm, force_drift_n_s, moment_drift_nm_s: Of left and right foot,
-            three axes each.
-        cross_talk: Of left and right foot, by rows of their matrices without the diagonals [1].
+        force_bias_n, moment_bias_nm, force_drift_n_s, moment_drift_nm_s: Errors of the sensors of
+            left and right foot, three axes each.
+        cross_talk: Of the sensors of left and right foot, by rows of their matrices without the
+            diagonals [1].
     """
 
     stiffness: tuple[float, ...]
@@ -205,23 +206,23 @@ class DrawnRobot:
     floor_friction: float
 
     def with_exact_sensors(self) -> "DrawnRobot":
-        """The robot without push and errors of IMU and feet, which stands as this one does."""
+        """Return the robot without push and errors of IMU and feet; it stands as this one does."""
         feet: dict[str, Any] = dict.fromkeys(FOOT_ERRORS, (0.0,))
         others = {"push_n": 0.0, "is_delayed": False, "is_inertial": False}
         return replace(self, mounting_rad=(0.0, 0.0), **others, **feet)
 
     def record(self) -> dict[str, float]:
-        """The robot in figures, by name with unit, for the records of episodes."""
+        """Return the robot as figures, by name with unit, for the records of episodes."""
         roll, pitch = self.mounting_rad
         figures = vars(self) | {"stiffness": np.mean(self.stiffness)}
         figures |= {"mounting_roll_rad": roll, "mounting_pitch_rad": pitch}
         del figures["mounting_rad"]
-        for name, title in _RMS_OF.items():
+        for name, title in _RMS_NAMES.items():
             figures[title] = np.sqrt(np.mean(np.square(figures.pop(name))))
         return {f"robot_{name}": float(figure) for name, figure in figures.items()}
 
 
-_RMS_OF = {
+_RMS_NAMES = {
     "homing_rad": "homing_rms_rad",
     "force_bias_n": "force_bias_rms_n",
     "moment_bias_nm": "moment_bias_rms_nm",
@@ -229,56 +230,56 @@ _RMS_OF = {
     "moment_drift_nm_s": "moment_drift_rms_nm_s",
     "cross_talk": "cross_talk_rms",
 }
-"""Quantities of several values, and the figure that records have of them."""
+"""Quantities of several values, and the name of their rms in records."""
 
 
 def draw_robots(
     ranges: Sequence[RobotRanges], number: int, joints: int, seed: Sequence[int]
 ) -> list[DrawnRobot]:
-    """Robots of ranges, the same in every process; equal shares of each of several ranges.
+    """Draw robots from ranges, the same in every process, with equal shares of several ranges.
 
     Args:
         ranges: One or several.
-        number: How many robots.
-        joints: How many joints each has.
-        seed: Of the generators; other seeds, other robots.
+        number: Number of robots.
+        joints: Number of joints of each.
+        seed: Seed of the generators.
     """
     ends = np.linspace(0, number, len(ranges) + 1).round().astype(int).tolist()
     return [
         robot
-        for index, own in enumerate(ranges)
-        for robot in _draw(own, ends[index + 1] - ends[index], joints, (*seed, index))
+        for index, part in enumerate(ranges)
+        for robot in _draw(part, ends[index + 1] - ends[index], joints, (*seed, index))
     ]
 
 
 def draw_robot(
     ranges: Sequence[RobotRanges], joints: int, generator: np.random.Generator
 ) -> DrawnRobot:
-    """One robot of ranges, which have equal chances where there are several."""
-    own = ranges[int(generator.integers(len(ranges)))]
-    (robot,) = _draw(own, 1, joints, [int(generator.integers(2**63))])
+    """Draw one robot from ranges; several ranges have equal chances."""
+    chosen = ranges[int(generator.integers(len(ranges)))]
+    (robot,) = _draw(chosen, 1, joints, [int(generator.integers(2**63))])
     return robot
 
 
 def latin_hypercube(number: int, columns: int, generator: np.random.Generator) -> Array:
-    """Points in the unit cube, (number, columns), one of each column in each of equal intervals."""
+    """Draw points in the unit cube, (number, columns); each of n equal intervals has one value."""
     strata = generator.permuted(np.tile(np.arange(number), (columns, 1)), axis=1)
     return (strata + generator.random((columns, number))).T / number
 
 
-_OF_SEVERAL = ("stiffness", "homing_rad", "mounting_rad", *FOOT_ERRORS)
-"""Quantities of which a robot has several values."""
+_SEVERAL_VALUES = ("stiffness", "homing_rad", "mounting_rad", *FOOT_ERRORS)
+"""Quantities with several values per robot."""
 _DIRECTION = "slope_direction"
 
 
 def _draw(
     ranges: RobotRanges, number: int, joints: int, seed: Sequence[int]
 ) -> Iterator[DrawnRobot]:
-    """Robots of one set of ranges."""
+    """Draw robots from one set of ranges."""
     width = dict.fromkeys(("joint_stiffness", "homing_rad"), joints)
-    width |= {"mounting_rad": 2, **_OF_BOTH_FEET}
+    width |= {"mounting_rad": 2, **_FOOT_VALUES}
     names = list(RobotRanges.model_fields)
-    # in this order, so that the draws of the first stay as they were
+    # a quantity's position seeds its draws: in this order, earlier draws stay as they were
     names.insert(names.index(FOOT_ERRORS[0]), _DIRECTION)
 
     def draw(name: str, low: float = 0.0, high: float = 1.0) -> Array:
@@ -300,8 +301,8 @@ def _draw(
     drawn["slope_direction_rad"] = 2.0 * np.pi * draw(_DIRECTION, high=turns)
     shares = {"is_delayed": has("delay_share"), "is_inertial": has("inertial_share")}
     for i in range(number):
-        values: dict[str, Any] = {name: bool(own[i]) for name, own in shares.items()}
-        for name, of_robots in drawn.items():
-            each = tuple(of_robots[i].tolist())
-            values[name] = each if name in _OF_SEVERAL else each[0]
+        values: dict[str, Any] = {name: bool(share[i]) for name, share in shares.items()}
+        for name, rows in drawn.items():
+            row = tuple(rows[i].tolist())
+            values[name] = row if name in _SEVERAL_VALUES else row[0]
         yield DrawnRobot(**values)

@@ -7,14 +7,14 @@ from elastic_env.core.signals import Array
 
 
 def matrix_of(quaternion: Array) -> Array:
-    """Rotation matrix (3, 3) of a unit quaternion (4,)."""
+    """Return the rotation matrix (3, 3) of a unit quaternion (4,)."""
     matrix = np.empty(9)
     mujoco.mju_quat2Mat(matrix, quaternion)
     return matrix.reshape(3, 3)
 
 
 def quaternion_of(matrix: Array) -> Array:
-    """Unit quaternion (4,) of a rotation matrix (3, 3)."""
+    """Return the unit quaternion (4,) of a rotation matrix (3, 3)."""
     quaternion = np.empty(4)
     mujoco.mju_mat2Quat(quaternion, matrix.ravel())
     return quaternion

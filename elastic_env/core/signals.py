@@ -22,7 +22,7 @@ BoolArray: TypeAlias = npt.NDArray[np.bool_]
 IntArray: TypeAlias = npt.NDArray[np.int64]
 Kind: TypeAlias = Literal["measured", "reference", "command"]
 Mirrored: TypeAlias = Literal["same", "opposite", "complement"]
-"""A value p where left and right change places: p, −p, or 1 − p as of a share."""
+"""A value p after left and right have changed places: p, −p, or 1 − p for a share."""
 
 
 @dataclass(frozen=True)
@@ -31,10 +31,9 @@ class Signal:
 
     Attributes:
         name, unit, meaning: In words.
-        low, high: Values that it can take.
-        kind: Whether sensors show it, the plan has it, or it was commanded; None for what follows
-            from these.
-        mirrored: What it is in the mirror; None where nobody has said so.
+        low, high: Bounds of its values.
+        kind: Source: sensors, the plan, or the command; None for a value computed from these.
+        mirrored: Value after left and right have changed places; None where it is not declared.
     """
 
     name: str
@@ -51,9 +50,9 @@ class SignalGroup:
     """Signals that are read together: neighbours in the observation, one field of a structured row.
 
     Attributes:
-        name: Of the field. Its columns are called `name.part`, a single one has the name alone.
+        name: Name of the field. Its columns are called `name.part`, a single one `name`.
         signals: Its columns.
-        shape: Of the field.
+        shape: Shape of the field.
     """
 
     name: str
@@ -69,19 +68,19 @@ class SignalGroup:
         parts: Mapping[str, Mirrored | None],
         kind: Kind | None,
     ) -> Self:
-        """A group of one unit.
+        """Make a group of one unit.
 
         Args:
-            name: Of the group.
-            unit: Of its columns.
-            meaning: Of a column, which may name its {part}.
-            parts: Names of the columns, and what each is in the mirror.
+            name: Name of the group.
+            unit: Unit of its columns.
+            meaning: Meaning of a column, with {part} for the name of the part.
+            parts: Names of the columns, and `mirrored` of each, see `Signal`.
             kind: See `Signal`.
         """
         names = [f"{name}.{part}" for part in parts] if len(parts) > 1 else [name]
         signals = tuple(
-            Signal(own, unit, meaning.format(part=part), kind=kind, mirrored=mirrored)
-            for own, (part, mirrored) in zip(names, parts.items(), strict=True)
+            Signal(column, unit, meaning.format(part=part), kind=kind, mirrored=mirrored)
+            for column, (part, mirrored) in zip(names, parts.items(), strict=True)
         )
         return cls(name, signals, (len(signals),))
 
@@ -105,15 +104,15 @@ class SignalTable:
 
     @classmethod
     def of(cls, groups: Sequence[SignalGroup]) -> Self:
-        """The columns of groups, one group after the other."""
+        """Make a table of the columns of groups, one group after the other."""
         return cls(tuple(signal for group in groups for signal in group.signals))
 
     def signals_of(self, name: str) -> tuple[Signal, ...]:
-        """The signals of a group, see `group`."""
+        """Return the signals of a group, see `group`."""
         return self.signals[self.group(name)]
 
     def columns(self, *names: str) -> slice | list[int]:
-        """Indices of the named columns, a slice if they are neighbours."""
+        """Return the indices of the named columns, a slice if they are neighbours."""
         indices = [self.names.index(name) for name in names]
         if indices == list(range(indices[0], indices[0] + len(indices))):
             return slice(indices[0], indices[0] + len(indices))
@@ -122,38 +121,39 @@ class SignalTable:
     @cached_property
     def _groups(self) -> dict[str, list[int]]:
         """Columns by the name of a signal, and by each part of it that ends before a dot."""
-        found: dict[str, list[int]] = {}
+        groups: dict[str, list[int]] = {}
         for i, name in enumerate(self.names):
             for part in itertools.accumulate(name.split("."), "{}.{}".format):
-                found.setdefault(part, []).append(i)
-        return found
+                groups.setdefault(part, []).append(i)
+        return groups
 
     def group(self, name: str) -> slice:
-        """Columns of the signal of that name, or of those whose names begin with it and a dot.
+        """Return the columns of a signal, or of all signals whose names begin with it and a dot.
 
         Raises:
             ConfigurationError: There is none, or they are not neighbours.
         """
-        found = self._groups.get(name)
-        if found is None:
-            groups = dict.fromkeys(own.split(".")[0] for own in self.names)
+        indices = self._groups.get(name)
+        if indices is None:
+            groups = dict.fromkeys(column.split(".")[0] for column in self.names)
             error = unknown_name("signal", name, groups)
             error.add_note("an environment's argument `sensors` adds signals to an observation")
             raise error
-        if found != list(range(found[0], found[-1] + 1)):
-            problem = f"the columns of {name!r} must be neighbours, they are {found}"
-            raise ConfigurationError(problem)
-        return slice(found[0], found[-1] + 1)
+        if indices != list(range(indices[0], indices[-1] + 1)):
+            raise ConfigurationError(
+                f"the columns of {name!r} must be neighbours, they are {indices}"
+            )
+        return slice(indices[0], indices[-1] + 1)
 
     def space(self, dtype: type[np.float32] | type[np.float64]) -> Any:
-        """The Gymnasium space of one world."""
+        """Return the Gymnasium space of one world."""
         low = np.array([signal.low for signal in self.signals])
         high = np.array([signal.high for signal in self.signals])
         return spaces.Box(low.astype(dtype), high.astype(dtype), dtype=dtype)
 
 
 def rename_group(signals: Sequence[Signal], group: str) -> tuple[Signal, ...]:
-    """The same quantities by another way, under the name of another group."""
+    """Return the same quantities, from another source, under the name of another group."""
     return tuple(
         replace(signal, name=".".join([group, *signal.name.split(".")[1:]]), kind=None)
         for signal in signals
@@ -161,4 +161,4 @@ def rename_group(signals: Sequence[Signal], group: str) -> tuple[Signal, ...]:
 
 
 NO_SIGNALS = SignalTable(())
-"""The table of an observation that holds nothing."""
+"""The table of an empty observation."""

@@ -1,8 +1,8 @@
 """YAML for configurations: plain data of bounded size, without YAML 1.1's guesses.
 
-What `yaml_of` and `yaml_line` write, `parse_yaml` reads.
+`parse_yaml` reads what `yaml_of` and `yaml_line` write.
 
-The limits hold before anything is built, so that a small file cannot ask for much memory.
+The limits are checked before anything is built, so that a small file cannot use much memory.
 """
 
 import re
@@ -12,29 +12,29 @@ import yaml
 from yaml.composer import Composer
 
 LARGEST_TEXT = 100_000
-"""Characters of a text in YAML."""
+"""Largest number of characters of a text."""
 DEEPEST_NESTING = 30
-"""Mappings and lists within one another."""
+"""Largest depth of mappings and lists within one another."""
 MOST_VALUES = 20_000
-"""Values of a text, with every alias counted as what it stands for."""
+"""Largest number of values of a text; an alias counts as all values that it repeats."""
 LONGEST_NUMBER = 40
-"""Characters of a number."""
+"""Largest number of characters of a number."""
 
 _NO_FOLDING = 10**9  # characters of a line
 _TAG = "tag:yaml.org,2002:"
 _EXPONENT = re.compile(r"^[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$")
 NO_TEXT = re.compile("[\x00\ud800-\udfff]")
-"""Characters that stand in no name and no file: zero bytes and halves of characters."""
+"""Characters that no name and no file can hold: zero bytes and halves of characters."""
 
 
 class _Loader(Composer, yaml.CSafeLoader):
     """PyYAML's loader with limits and the numbers of YAML 1.2 (1e3), without dates and tags.
 
-    PyYAML's composer, in which limits can be set, is above libyaml's parser, several times as fast
+    The composer is PyYAML's, which can be limited. The parser is libyaml's, several times as fast
     as PyYAML's.
     """
 
-    # dates stay text: a list of the resolvers of its own
+    # without the resolver of dates: they stay text
     yaml_implicit_resolvers = {
         first: [pair for pair in resolvers if pair[0] != f"{_TAG}timestamp"]
         for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
@@ -44,10 +44,10 @@ class _Loader(Composer, yaml.CSafeLoader):
         yaml.CSafeLoader.__init__(self, text)
         Composer.__init__(self)
         self._depth = 0
-        self._sizes: dict[int, int] = {}  # values that a node stands for, by its id
+        self._sizes: dict[int, int] = {}  # number of values of a node, by its id
 
     def compose_node(self, parent: Any, index: Any) -> Any:
-        """A node within the limits."""
+        """Compose a node within the limits."""
         event: Any = self.peek_event()
         if isinstance(event, yaml.AliasEvent):
             node = super().compose_node(parent, index)
@@ -72,7 +72,7 @@ class _Loader(Composer, yaml.CSafeLoader):
         return node
 
     def construct_number(self, node: Any) -> int | float:
-        """A number of bounded length."""
+        """Convert a number of bounded length."""
         text = self.construct_scalar(node)
         if len(text) > LONGEST_NUMBER:
             bound = f"at most {LONGEST_NUMBER} characters"
@@ -92,11 +92,11 @@ for _kind in ("int", "float"):
 
 
 def parse_yaml(text: str) -> Any:
-    """Content of a text in YAML: plain mappings with text as keys, lists and scalars.
+    """Parse a text in YAML into plain mappings with text as keys, lists and scalars.
 
     Raises:
-        yaml.YAMLError: It is not YAML, beyond the limits of this module, or holds tags, dates as
-            objects, zero bytes, or a key twice.
+        yaml.YAMLError: The text is not YAML, exceeds the limits of this module, or holds tags,
+            dates as objects, zero bytes, or a key twice.
     """
     if len(text) > LARGEST_TEXT:
         bound = f"at most {LARGEST_TEXT} characters"
@@ -105,33 +105,33 @@ def parse_yaml(text: str) -> Any:
     try:
         return loader.get_single_data()
     except yaml.MarkedYAMLError as error:
-        raise _with_quotes(text, error) from None
+        raise _add_quotes_cure(text, error) from None
     finally:
         loader.dispose()
 
 
-_NEAR = 200
-"""Characters around an error that are looked at: all of a long line would take minutes."""
+_SEARCHED = 200
+"""Characters on both sides of an error that are searched: a whole long line would take minutes."""
 _PATTERN = re.compile(
     r"""(?P<key>[^\s{},:'"]*\*[^\s{},:'"]*)\s*(?::(?P<value>\s*\{[^}]*\}|[^,}#]*))?"""
 )
 
 
-def _with_quotes(text: str, error: yaml.MarkedYAMLError) -> yaml.MarkedYAMLError:
-    """The error with its cure, where a pattern's star is taken for YAML's sign of an alias."""
+def _add_quotes_cure(text: str, error: yaml.MarkedYAMLError) -> yaml.MarkedYAMLError:
+    """Replace the error by one with the cure, where YAML read the star of a pattern as an alias."""
     is_clear = error.problem is None or error.problem.startswith("the alias")
     lines = [] if is_clear else text.splitlines()
     for mark in (error.context_mark, error.problem_mark):
         if mark is None or mark.line >= len(lines):
             continue
-        begin = max(mark.column - _NEAR, 0)
-        near = lines[mark.line][begin : mark.column + _NEAR]
-        for found in _PATTERN.finditer(near):
-            if not found.start() <= mark.column - begin < found.end("key"):
+        begin = max(mark.column - _SEARCHED, 0)
+        text_around = lines[mark.line][begin : mark.column + _SEARCHED]
+        for pattern in _PATTERN.finditer(text_around):
+            if not pattern.start() <= mark.column - begin < pattern.end("key"):
                 continue
-            key = found["key"][:40]
+            key = pattern["key"][:40]
             key = key if "[" in key and "]" in key else key.strip("[]")
-            value = "" if found["value"] is None else f": {found['value'].strip()[:40]}"
+            value = "" if pattern["value"] is None else f": {pattern['value'].strip()[:40]}"
             return _refusal(mark, f'put the pattern in quotes: "{key}"{value}')
     return error
 
@@ -140,7 +140,7 @@ class _Dumper(yaml.SafeDumper):
     """PyYAML's dumper with quotes around text that `parse_yaml` would read as a number or fold."""
 
     def represent_text(self, text: str) -> yaml.ScalarNode:
-        """Text; with escapes where it holds line ends or other characters that do not print."""
+        """Represent text, with escapes where it holds line ends or others that do not print."""
         style = None if text.isprintable() else '"'
         return self.represent_scalar(f"{_TAG}str", text, style)
 
@@ -150,19 +150,19 @@ _Dumper.add_implicit_resolver(f"{_TAG}float", _EXPONENT, list("-+.0123456789"))
 
 
 def yaml_of(content: Any) -> str:
-    """Plain data as YAML that `parse_yaml` reads."""
+    """Write plain data as YAML that `parse_yaml` reads."""
     return yaml.dump(content, Dumper=_Dumper, allow_unicode=True, sort_keys=False)
 
 
 def yaml_line(name: str, value: Any, comment: str) -> str:
-    """An entry of a mapping with a comment, on its own line; a long name takes two lines.
+    """Write an entry of a mapping with a comment on one line; a long name takes two lines.
 
     Args:
         name: Key of the entry, any text that a file can hold.
-        value: Plain data without a mapping or list in it that holds another one.
-        comment: Its characters that do not print become spaces.
+        value: Plain data, at most one level of mappings or lists deep.
+        comment: Comment; characters that do not print become spaces.
     """
-    # None: flow style for what holds no mapping or list
+    # None: flow style for a value that holds no mapping or list
     flow = None if isinstance(value, dict | list) else False
     style: dict[str, Any] = {"default_flow_style": flow, "width": _NO_FOLDING}
     text = yaml.dump({name: value}, Dumper=_Dumper, allow_unicode=True, **style)
@@ -181,16 +181,16 @@ def _require_plain(event: Any) -> None:
 
 
 def _require_names(loader: _Loader, node: yaml.MappingNode) -> None:
-    """Refuse keys of a mapping that are no text, and those that stand there twice."""
+    """Refuse keys of a mapping that are no text, and duplicate keys."""
     seen: set[str] = set()
     for key, _ in node.value:
         if key.tag == f"{_TAG}merge":
             continue
         if key.tag not in (f"{_TAG}str", f"{_TAG}value"):
             is_scalar = isinstance(key, yaml.ScalarNode)
-            what = repr(loader.construct_object(key)) if is_scalar else f"a {key.id}"
+            got = repr(loader.construct_object(key)) if is_scalar else f"a {key.id}"
             cure = "put it in quotes if it is meant"
-            problem = f"the name of a parameter must be text, got {what}; {cure}"
+            problem = f"the name of a parameter must be text, got {got}; {cure}"
             raise _refusal(key, problem)
         if key.value in seen:
             twice = f"the key {key.value[:100]!r} stands twice in one mapping"
@@ -199,13 +199,13 @@ def _require_names(loader: _Loader, node: yaml.MappingNode) -> None:
 
 
 def _parts(node: yaml.Node | None) -> list[yaml.Node]:
-    """Nodes directly within a node."""
+    """Return the nodes directly within a node."""
     if isinstance(node, yaml.MappingNode):
         return [part for pair in node.value for part in pair]
     return list(node.value) if isinstance(node, yaml.SequenceNode) else []
 
 
 def _refusal(at: Any, problem: str) -> yaml.MarkedYAMLError:
-    """An error that names the place, which is a node, an event or a mark."""
+    """Return an error at a place: a node, an event or a mark."""
     mark = getattr(at, "start_mark", at)
     return yaml.MarkedYAMLError(problem=problem, problem_mark=mark)

@@ -1,4 +1,4 @@
-"""Pictures on machines without a display: MuJoCo chooses its OpenGL when it is first imported."""
+"""Drawing on machines without a display: MuJoCo chooses its OpenGL at its first import."""
 
 import ctypes
 import os
@@ -15,9 +15,9 @@ CURE = (
 
 def prefer_egl() -> None:
     """Let MuJoCo draw through EGL where there is no display. Call it before importing MuJoCo."""
-    is_told = any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY"))
-    is_told = is_told or _VARIABLE in os.environ
-    if sys.platform == "linux" and not is_told and _has_egl():
+    is_chosen = any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY"))
+    is_chosen = is_chosen or _VARIABLE in os.environ
+    if sys.platform == "linux" and not is_chosen and _has_egl():
         os.environ[_VARIABLE] = "egl"
 
 

@@ -1,4 +1,4 @@
-"""MuJoCo models that are only drawn, as an image with a caption or in a window."""
+"""Pictures of MuJoCo models that are only drawn: an image with a caption, or a window."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -15,7 +15,7 @@ from elastic_env.rendering.headless import CURE
 Image: TypeAlias = npt.NDArray[np.uint8]
 Rgba: TypeAlias = tuple[float, float, float, float]
 Legend: TypeAlias = Sequence[tuple[str, Rgba]]
-"""Words under a picture, each in the colour of what it names."""
+"""Words under a picture, each in the colour of the part that it names."""
 
 CAMERA = "front"
 """The camera through which a display model is seen."""
@@ -24,14 +24,14 @@ _BACKGROUND = (0.96, 0.97, 0.98)
 _TEXT_RGB = (30, 34, 40)
 _MARGIN = 12
 _CHARACTERS_PER_ROW = 37
-"""Width of a picture over the size of its letters."""
+"""Width of a picture divided by the size of its letters."""
 
 
 class Picture(ABC):
     """Draws the present state of a task by a display model, which is posed and never stepped.
 
     Args:
-        spec: What is drawn, with a camera named `CAMERA`.
+        spec: The display model, with a camera named `CAMERA`.
         legend: Words under the image.
     """
 
@@ -44,14 +44,14 @@ class Picture(ABC):
 
     @abstractmethod
     def _pose(self, now: dict[str, float], world: int) -> None:
-        """Move the display model to the present state of a world, whose signals are given."""
+        """Move the display model to the present state of a world, by its signals."""
 
     @abstractmethod
     def _caption(self, now: dict[str, float], world: int) -> list[str]:
-        """Lines of text for the state that was posed last."""
+        """Return the lines of text for the state that was posed last."""
 
     def rgb(self, signals: Signals, world: int = 0) -> Image:
-        """An image of a world, (height, width, 3)."""
+        """Return an image of a world, (height, width, 3)."""
         caption = self._update(signals, world)
         if self._renderer is None:
             self._renderer = renderer(self._model)
@@ -77,7 +77,7 @@ class Picture(ABC):
         self._renderer = self._viewer = None
 
     def _update(self, signals: Signals, world: int) -> list[str]:
-        """Pose the display model; the caption that goes with it."""
+        """Pose the display model, and return its caption."""
         now = {name: float(values[world]) for name, values in signals.items()}
         self._pose(now, world)
         mujoco.mj_forward(self._model, self._data)
@@ -108,7 +108,7 @@ def set_stage(spec: mujoco.MjSpec, width: int, height: int) -> None:
 
 def _window(model: mujoco.MjModel, data: mujoco.MjData) -> Any:
     try:
-        # only here: a machine that only computes may have neither GLFW nor a display
+        # imported late: a machine without a screen may have neither GLFW nor a display
         import glfw
         import mujoco.viewer as views
     except (ImportError, RuntimeError) as error:
@@ -124,7 +124,7 @@ def _window(model: mujoco.MjModel, data: mujoco.MjData) -> Any:
 
 
 def renderer(model: mujoco.MjModel) -> Any:
-    """A renderer of images in the size that the model names.
+    """Return a renderer of images in the size that the model sets.
 
     Raises:
         ElasticError: The machine cannot draw.
@@ -137,7 +137,7 @@ def renderer(model: mujoco.MjModel) -> Any:
 
 
 def with_text(image: Image, lines: list[str], legend: Legend = ()) -> Image:
-    """The image with its caption above and its legend below."""
+    """Return the image with its caption above and its legend below."""
     import PIL.Image  # Pillow comes with Gymnasium's MuJoCo extra
     import PIL.ImageDraw
     import PIL.ImageFont

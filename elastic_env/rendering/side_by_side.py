@@ -1,10 +1,9 @@
-"""A robot three times side by side: reference, motor side and link side.
+"""Scene of a robot three times side by side: reference, motor side and link side.
 
-Deviations from the reference are enlarged.
-
-What is drawn of a joint stands at q_ref + factor · (x − q_ref), where x is the angle of the motor
-or of the link. A floating base deviates from its planned pose by factor times its true deviation.
-That of the motor side is the planned one, as an encoder does not see where the robot is.
+Deviations from the reference are enlarged: a joint is drawn at q_ref + factor · (x − q_ref), where
+x is the angle of the motor or of the link. A floating base deviates from its planned pose by factor
+times its true deviation. The motor side has the planned base, as an encoder does not measure where
+the robot is.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -27,14 +26,14 @@ _ELEVATION_DEG = -15.0
 
 
 @dataclass(frozen=True)
-class Alone:
-    """One robot as it is drawn.
+class DisplayRobot:
+    """Display model of one robot.
 
     Attributes:
         spec: Its bodies, without floor and light.
         joints: Names of its joints, in the order of `Sides`.
-        right: Where the next robot stands [m], (3,).
-        base: Name of its free joint; None of a robot that is bolted down.
+        right: Place of the next robot, from this one [m], (3,).
+        base: Name of its free joint; None for a robot on a fixed base.
         dress: Adds floor and light to the scene.
     """
 
@@ -47,7 +46,7 @@ class Alone:
 
 @dataclass(frozen=True)
 class Sides:
-    """A robot at one time.
+    """Angles and base of a robot at one time.
 
     Attributes:
         q_ref, theta, q: Reference, motor side and link side, (n,) [rad].
@@ -65,21 +64,21 @@ class Sides:
 class HasSides(Protocol):
     """A picture whose robot can be drawn side by side."""
 
-    def alone(self) -> Alone:
-        """The robot."""
+    def display_robot(self) -> DisplayRobot:
+        """Return the robot's display model."""
         ...
 
     def sides(self, now: Mapping[str, float], world: int = 0) -> Sides:
-        """Its posture, from the present signals of a world."""
+        """Return its angles and base, from the present signals of a world."""
         ...
 
 
 def enlarged_pose(planned: Array, true: Array, factor: float) -> Array:
-    """A pose that deviates from the planned one by a factor times the true deviation, (7,).
+    """Return a pose that deviates from the planned one by a factor times the true deviation, (7,).
 
     Args:
         planned: Position [m] and quaternion, (7,).
-        true: The same, in truth.
+        true: True position and quaternion, (7,).
         factor: 0 gives the planned pose, 1 the true one.
     """
     turn = np.empty(3)
@@ -90,23 +89,23 @@ def enlarged_pose(planned: Array, true: Array, factor: float) -> Array:
 
 
 class SideBySide:
-    """The model of three robots, and their posture.
+    """The model of three robots, and their sides.
 
     Args:
-        robot: What is drawn three times.
+        robot: Robot that is drawn three times.
 
     Attributes:
         model: Compiled for drawing, never stepped.
     """
 
-    def __init__(self, robot: Alone) -> None:
+    def __init__(self, robot: DisplayRobot) -> None:
         spec = mujoco.MjSpec()
         set_stage(spec, _SIZE, _SIZE)
-        for name in ("cone", "impratio", "integrator"):  # as attaching wants them
+        for name in ("cone", "impratio", "integrator"):  # attaching needs equal options
             setattr(spec.option, name, getattr(robot.spec.option, name))
         spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
         robot.dress(spec)
-        # where a viewer looks who sees them from left to right
+        # the camera sees the robots from left to right
         forward = np.cross([0.0, 0.0, 1.0], robot.right)
         azimuth = np.degrees(np.arctan2(forward[1], forward[0]))
         spec.visual.global_.azimuth = float(azimuth)
@@ -115,11 +114,11 @@ class SideBySide:
         self._offsets = {REFERENCE: -right, MOTOR: 0.0 * right, LINK: right}
         colours = {REFERENCE: _REFERENCE_RGBA, MOTOR: _MOTOR_RGBA, LINK: None}
         for copy, rgba in colours.items():
-            own = robot.spec.copy()
+            spec_copy = robot.spec.copy()
             if rgba is not None:
-                paint(own, rgba)
+                paint(spec_copy, rgba)
             frame = spec.worldbody.add_frame(pos=self._offsets[copy])
-            spec.attach(own, prefix=copy, frame=frame)
+            spec.attach(spec_copy, prefix=copy, frame=frame)
         self.model = spec.compile()
         self._robot = robot
 
@@ -127,13 +126,13 @@ class SideBySide:
         """Bring the three robots into their postures.
 
         Args:
-            data: Of `model`; positions are written, nothing else.
-            sides: Where the robot is.
-            factor: By which deviations from the reference are enlarged.
+            data: State of `model`; only positions are written.
+            sides: Angles and base of the robot.
+            factor: Factor by which deviations from the reference are enlarged.
         """
         bases = {REFERENCE: sides.base_ref, MOTOR: sides.base_ref, LINK: sides.base}
-        sides_of = {REFERENCE: sides.q_ref, MOTOR: sides.theta, LINK: sides.q}
-        for copy, angles in sides_of.items():
+        angles_of = {REFERENCE: sides.q_ref, MOTOR: sides.theta, LINK: sides.q}
+        for copy, angles in angles_of.items():
             drawn = sides.q_ref + factor * (angles - sides.q_ref)
             for name, angle in zip(self._robot.joints, drawn, strict=True):
                 data.joint(copy + name).qpos = angle

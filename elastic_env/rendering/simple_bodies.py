@@ -1,4 +1,4 @@
-"""Bodies to look at for links without shapes: rods from joint to joint, and balls at the ends."""
+"""Simple shapes for links without any: rods from joint to joint, and balls at the ends."""
 
 from typing import Any
 
@@ -6,9 +6,9 @@ import mujoco
 import numpy as np
 
 _RADIUS = 0.02
-"""Of a rod, over the size of the robot."""
+"""Radius of a rod divided by the size of the robot."""
 _RGBA = (0.75, 0.76, 0.78, 1.0)
-_LOOK: dict[str, Any] = {"rgba": _RGBA, "mass": 0.0, "contype": 0, "conaffinity": 0}
+_APPEARANCE: dict[str, Any] = {"rgba": _RGBA, "mass": 0.0, "contype": 0, "conaffinity": 0}
 _CAPSULE = mujoco.mjtGeom.mjGEOM_CAPSULE
 _SPHERE = mujoco.mjtGeom.mjGEOM_SPHERE
 
@@ -19,7 +19,7 @@ def add_simple_bodies(spec: mujoco.MjSpec) -> None:
     Rods and balls have no mass and touch nothing.
 
     Args:
-        spec: It is changed. It has to compile.
+        spec: A specification that compiles; it is changed.
     """
     model = spec.copy().compile()
     radius = _RADIUS * float(np.linalg.norm(model.body_pos, axis=1).sum())
@@ -34,4 +34,4 @@ def add_simple_bodies(spec: mujoco.MjSpec) -> None:
 
 
 def _add(body: Any, kind: mujoco.mjtGeom, radius: float, **place: Any) -> None:
-    body.add_geom(type=kind, size=[radius, 0.0, 0.0], **_LOOK, **place)
+    body.add_geom(type=kind, size=[radius, 0.0, 0.0], **_APPEARANCE, **place)

@@ -32,7 +32,7 @@ from elastic_env.motion.references import Multisine
 from elastic_env.motion.trajectory import Motion
 from elastic_env.registration import Robot, as_model
 from elastic_env.rendering.picture import CAMERA, set_stage
-from elastic_env.rendering.side_by_side import Alone, Sides
+from elastic_env.rendering.side_by_side import DisplayRobot, Sides
 from elastic_env.rigid.rigid_body import RigidBody
 from elastic_env.rigid.tree.end_effector import EndEffector
 from elastic_env.robots import deviations
@@ -325,10 +325,10 @@ class JointPicture(deviations.DeviationPicture):
         self._task = task
         self._joints = list(robot.joints)
 
-    def alone(self) -> Alone:
+    def display_robot(self) -> DisplayRobot:
         """The robot of a side-by-side picture."""
         extent = self._robot.rigid().compile().stat.extent
-        return Alone(self._robot.rigid(), self._joints, (1.5 * extent, 0.0, 0.0))
+        return DisplayRobot(self._robot.rigid(), self._joints, (1.5 * extent, 0.0, 0.0))
 
     def sides(self, now: Mapping[str, float], world: int = 0) -> Sides:  # noqa: ARG002
         """Reference, motor side and link side of a world."""

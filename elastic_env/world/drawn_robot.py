@@ -40,9 +40,9 @@ def set_joints(
         scenario: It.
     """
     if len(springs):
-        further = robot.backlash_rad - scenario.fixed("backlash_rad")
+        further = robot.backlash_rad - scenario.fixed_value("backlash_rad")
         ends = further * np.array([-0.5, 0.5])
-        factor = np.array(robot.stiffness) / scenario.fixed("stiffness")
+        factor = np.array(robot.stiffness) / scenario.fixed_value("stiffness")
         K = model.tendon_stiffness[springs] * factor
         lengths = model.tendon_lengthspring[springs] + ends
         field("tendon_lengthspring")[springs] = lengths
@@ -84,6 +84,6 @@ def stiffest_plant(model: mujoco.MjModel, scenario: Scenario) -> mujoco.MjModel:
     """A plant with the stiffest springs and strongest dampers that a scenario draws."""
     stiffest = max(own.stiffness[1] * own.joint_stiffness[1] for own in scenario.parts)
     plant = copy.copy(model)
-    plant.tendon_stiffness[:] *= stiffest / scenario.fixed("stiffness")
+    plant.tendon_stiffness[:] *= stiffest / scenario.fixed_value("stiffness")
     plant.tendon_damping[:] *= max(own.damping[1] for own in scenario.parts)
     return plant

@@ -48,8 +48,8 @@ class TaskConfig(Model):
         """
         scenario = self.scenario
         return self.with_friction_of_ground(joint).replace(
-            stiffness=joint.stiffness * scenario.fixed("stiffness"),
-            backlash=joint.backlash + scenario.fixed("backlash_rad"),
+            stiffness=joint.stiffness * scenario.fixed_value("stiffness"),
+            backlash=joint.backlash + scenario.fixed_value("backlash_rad"),
         )
 
     def with_friction_of_ground(self, joint: ElasticJoint) -> ElasticJoint:

@@ -80,7 +80,7 @@ class Scenario(RobotRanges):
     @property
     def shoulder_load_kg(self) -> float:
         """Load that all robots have on their shoulders, part of the true model [kg]."""
-        return 0.0 if {*LOAD_PLACE} & {*self.changes} else self.fixed("load_kg")
+        return 0.0 if {*LOAD_PLACE} & {*self.changes} else self.fixed_value("load_kg")
 
     @property
     def places_loads(self) -> bool:
@@ -145,7 +145,7 @@ def _without_walking(parameters: dict[str, Any]) -> dict[str, Any]:
     """Parameters of a change for a robot that does not walk."""
     kept = {name: own for name, own in parameters.items() if name not in WALKER_FIELDS}
     if "mixture" in kept:
-        kept["mixture"] = [own.on_fixed_base() for own in kept["mixture"]]
+        kept["mixture"] = [own.without_walker_fields() for own in kept["mixture"]]
     return kept
 
 

@@ -165,7 +165,7 @@ def name_options(**of_one: str) -> Iterator[None]:
     try:
         yield
     except ModelError as error:
-        raise ConfigurationError(error.describe(spelt=spelt)) from None
+        raise ConfigurationError(error.describe(spelling=spelt)) from None
 
 
 def _option(name: str) -> str:

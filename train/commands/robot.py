@@ -27,7 +27,7 @@ from elastic_env.joint.friction import dry_friction
 from elastic_env.joint.model_text import is_text, name_of, without_declaration
 from elastic_env.motion.arm_references import Poses
 from elastic_env.rendering.picture import Image, with_text
-from elastic_env.rendering.sag import ENLARGED, SagViews
+from elastic_env.rendering.sag import ENLARGEMENT, SagViews
 from elastic_env.robots.gallery import GALLERY, gallery_file, gallery_joints, gallery_robot
 from elastic_env.robots.joint_robot import JointRobotConfig
 from elastic_env.robots.robot.environment import configure_robot
@@ -361,7 +361,7 @@ def picture(config: JointRobotConfig, plant: JointPlant) -> Image:
         caption = [
             f"end effector off by {errors[0]:.2f} mm without, {errors[1]:.3f} mm with compensation",
             "at rest without friction; deviations from the translucent reference drawn x"
-            f" {ENLARGED:g}",
+            f" {ENLARGEMENT:g}",
         ]
         rows.append(with_text(views.draw(twice, links), caption))
     return np.concatenate(rows)

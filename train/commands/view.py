@@ -30,7 +30,7 @@ from rich.console import Console
 
 from elastic_env.core.config import quantity
 from elastic_env.core.errors import ElasticError
-from elastic_env.rendering.side_by_side import Alone, SideBySide, Sides
+from elastic_env.rendering.side_by_side import DisplayRobot, SideBySide, Sides
 from train.commands.play import WatchedEpisode, episode, steps_within
 from train.commands.view_proxy import LOOPBACK, Access, Proxy, open_listener
 from train.evaluate.conditions import Condition
@@ -61,7 +61,7 @@ class Recording:
         frames: Where the robot is.
     """
 
-    robot: Alone
+    robot: DisplayRobot
     times_s: Sequence[float]
     frames: Sequence[Sides]
 
@@ -118,7 +118,7 @@ def record(condition: Condition, console: Console, max_s: float | None) -> Recor
             if step % every == 0:
                 times_s.append(float(now["time_s"]))
                 frames.append(picture.sides(now))
-        return Recording(picture.alone(), times_s, frames)
+        return Recording(picture.display_robot(), times_s, frames)
 
 
 class _Poses(plugin.SimPlugin):

@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 
 from elastic_env.rendering.picture import set_stage
-from elastic_env.rendering.side_by_side import Alone, Sides
+from elastic_env.rendering.side_by_side import DisplayRobot, Sides
 from elastic_env.robots import deviations
 from elastic_env.robots.deviations import DeviationPicture, enlarge_deviation
 from elastic_env.robots.testbed.model import Pendulum
@@ -34,13 +34,13 @@ class TestbedPicture(DeviationPicture):
         super().__init__(spec, [*colours.items()])
         self._pendulum = pendulum
 
-    def alone(self) -> Alone:
+    def display_robot(self) -> DisplayRobot:
         """The robot of a side-by-side picture."""
         spec = _display_spec(self._pendulum)
         for element in (spec.body("reference"), spec.body("rotor"), *spec.cameras):
             spec.delete(element)
         right = (1.6 * self._pendulum.com_distance, 0.0, 0.0)
-        return Alone(spec, ["link"], right, dress=_add_light)
+        return DisplayRobot(spec, ["link"], right, dress=_add_light)
 
     def sides(self, now: Mapping[str, float], world: int = 0) -> Sides:  # noqa: ARG002
         """Reference, motor side and link side of a world."""

@@ -18,7 +18,7 @@ from elastic_env.core.signals import Array
 from elastic_env.motion.gait import LEFT
 from elastic_env.motion.walk_plan import WalkPlan
 from elastic_env.rendering.picture import CAMERA, Picture
-from elastic_env.rendering.side_by_side import Alone, Sides
+from elastic_env.rendering.side_by_side import DisplayRobot, Sides
 from elastic_env.rigid.biped import Biped
 from elastic_env.rigid.contact_force import shares
 from elastic_env.rigid.leg_kinematics import foot_pose, leg_angles, rotation_z
@@ -139,11 +139,11 @@ class WalkerPicture(Picture):
         self._eye = self._model.camera(CAMERA).pos[:2].copy()
         self._lights = self._model.light_pos[:, :2].copy()
 
-    def alone(self) -> Alone:
+    def display_robot(self) -> DisplayRobot:
         """The robot of a side-by-side picture."""
         spec = humanoid.solid_spec(self._task.config.robot)
         dress = humanoid.set_floor_and_light
-        return Alone(spec, LEG_JOINTS, _ROBOT_DISTANCE_M, "pelvis", dress)
+        return DisplayRobot(spec, LEG_JOINTS, _ROBOT_DISTANCE_M, "pelvis", dress)
 
     def sides(self, now: Mapping[str, float], world: int = 0) -> Sides:
         """Reference, motor side and link side of a world."""
