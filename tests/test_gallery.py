@@ -22,9 +22,9 @@ from elastic_env.core.signals import Array
 from elastic_env.joint.elasticity import ElasticJoint
 from elastic_env.joint.joint_names import motor_name
 from elastic_env.joint.make_elastic import make_elastic, transform_hinges
-from elastic_env.joint.model_file import keep_shapes, urdf_spec
-from elastic_env.joint.supported_models import hinges_of
+from elastic_env.joint.model_joints import hinges_of
 from elastic_env.joint.time_step import largest_stable_timestep
+from elastic_env.joint.urdf import keep_shapes, urdf_spec
 from elastic_env.rendering.simple_bodies import add_simple_bodies
 from elastic_env.rigid.rigid_body import RigidBody
 from elastic_env.robots import gallery

@@ -18,8 +18,8 @@ import elastic_env  # noqa: F401  registers the environment
 from baselines import PositionCompensator
 from elastic_env import ElasticJoint, Servo, make_elastic
 from elastic_env.core.errors import ConfigurationError
+from elastic_env.joint.commanded_joints import coupled_fingers
 from elastic_env.joint.model_file import compiled_model, read_model
-from elastic_env.joint.supported_models import coupled_fingers
 from elastic_env.robots.robot.model import read_robot
 from train.commands.robot import Robot, robot_arguments, write_robot
 
@@ -720,10 +720,10 @@ def test_everybody_takes_a_specification_and_says_what_a_compiled_model_is_good_
 
 LONG = """
 import time, mujoco
-from elastic_env.joint.model_file import from_mujoco
+from elastic_env.joint.compile_model import call_mujoco
 text = '<mujoco><worldbody><replicate count="200000"><site/></replicate></worldbody></mujoco>'
 print("now", flush=True)
-from_mujoco(lambda: mujoco.MjSpec.from_string(text), "the model", "read")
+call_mujoco(lambda: mujoco.MjSpec.from_string(text), "the model", "read")
 """
 
 

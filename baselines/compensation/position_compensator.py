@@ -39,6 +39,7 @@ from elastic_env.core.errors import (
     unknown_name,
 )
 from elastic_env.core.signals import Array, BoolArray
+from elastic_env.joint.commanded_joints import commanded_hinges
 from elastic_env.joint.joint_settings import (
     HELD,
     RIGID,
@@ -50,14 +51,9 @@ from elastic_env.joint.joint_settings import (
 )
 from elastic_env.joint.load_continuation import follow_load
 from elastic_env.joint.model_file import GivenModel, compiled_model
+from elastic_env.joint.model_joints import held_positions, hinges_of
 from elastic_env.joint.model_servo import position_servo
-from elastic_env.joint.supported_models import (
-    commanded_hinges,
-    held_positions,
-    hinges_of,
-    require_known_torque,
-    require_robot,
-)
+from elastic_env.joint.supported_models import require_known_torque, require_robot
 from elastic_env.motion.trajectory import minimum_jerk
 from elastic_env.rigid.rigid_body import RigidBody
 from elastic_env.world.robot_model import joint_ranges

@@ -15,7 +15,7 @@ from elastic_env.core.config import Model
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array, BoolArray
 from elastic_env.core.yaml_text import yaml_line
-from elastic_env.joint.supported_models import hinges_of
+from elastic_env.joint.model_joints import hinges_of
 
 Source = Literal["told apart", "wide interval", "no upper end", "rigid", "assumed"]
 """Origin of a joint's stiffness.

@@ -7,7 +7,7 @@ import numpy as np
 
 from elastic_env.core.errors import ConfigurationError, unknown_name
 from elastic_env.core.signals import Array
-from elastic_env.joint.supported_models import hinges_of, home_of
+from elastic_env.joint.model_joints import hinges_of, home_of
 
 GRAVITY = 9.80665
 """Standard acceleration of free fall [m/s²]."""

@@ -10,7 +10,7 @@ import numpy as np
 from baselines.compensation.position_compensator import PositionCompensator
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
-from elastic_env.joint.supported_models import held_positions
+from elastic_env.joint.model_joints import held_positions
 from elastic_env.rigid.tree.end_effector import EndEffector, outermost_body, site_or_body
 from elastic_env.world.robot_model import joint_ranges
 

@@ -36,7 +36,7 @@ from elastic_env.core.errors import ActionError, ConfigurationError, choices_lis
 from elastic_env.core.signals import Array
 from elastic_env.joint.joint_settings import HELD, RIGID, key_of
 from elastic_env.joint.model_file import compiled_model
-from elastic_env.joint.supported_models import hinges_of
+from elastic_env.joint.model_joints import hinges_of
 
 _CENTRE = {"degrees": 0.0, "range": 0.0, "percent": 50.0}
 _WIDTH = {"range": 200.0, "percent": 100.0}

@@ -21,7 +21,7 @@ import numpy as np  # noqa: E402
 from baselines import PositionCompensator  # noqa: E402
 from elastic_env.core.signals import Array  # noqa: E402
 from elastic_env.joint.elasticity import static_link_angle  # noqa: E402
-from elastic_env.joint.supported_models import hinges_of  # noqa: E402
+from elastic_env.joint.model_joints import hinges_of  # noqa: E402
 from elastic_env.rendering.picture import Image  # noqa: E402
 from elastic_env.rendering.sag import SagViews  # noqa: E402
 from elastic_env.rendering.simple_bodies import add_simple_bodies  # noqa: E402

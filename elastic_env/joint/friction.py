@@ -36,7 +36,7 @@ def dry_friction(
         load: τ_J, the torque that the transmission passes, (..., n) [N·m].
         coulomb: F₀, broadcast against (..., n) [N·m].
         load_ratio: c, share of the load that is lost to friction, likewise [1].
-        static: F_s, what friction at rest has more, likewise [N·m].
+        static: F_s, excess of the friction at rest, likewise [N·m].
         stribeck_speed: ω_s, by which F_s falls to 37 %, likewise; 0 for F_s at rest only [rad/s].
 
     Returns:
@@ -62,7 +62,7 @@ def passed_torque(
 
     .. math:: \tau_J = \frac{\tau + s F}{1 - s c \,\mathrm{sign}(\tau + s F)}
 
-    Up a slope of load that is (τ + F)/(1 − c), down it (τ − F)/(1 + c).
+    Against a positive load that is (τ + F)/(1 − c), with it (τ − F)/(1 + c).
 
     Args:
         torque: τ that the link needs, gravity and inertia, (..., n) [N·m].
@@ -79,7 +79,7 @@ def passed_torque(
 
 
 class FrictionTerms(Model):
-    """Terms of `dry_friction` that change with load and speed."""
+    """Terms of `dry_friction` that change with load or speed."""
 
     load_friction: float = quantity("1", 0.0, ge=0, lt=1)
     """c, share of the torque passed that is lost to dry friction, see `dry_friction` [1]."""

@@ -1,4 +1,4 @@
-"""Names that an elastic joint gives to its parts, and addresses of its angles in a model."""
+"""Names of the parts of an elastic joint, and addresses of its angles in a model."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -28,7 +28,7 @@ FRICTION_SUFFIX = "_dry_friction"
 
 
 def friction_name(joint: str) -> str:
-    """Name of the numbers of a dry friction that varies."""
+    """Name of the parameters of a varying dry friction."""
     return f"{joint}{FRICTION_SUFFIX}"
 
 
@@ -48,7 +48,7 @@ class JointAddresses:
 
     @classmethod
     def of(cls, model: mujoco.MjModel, joints: Sequence[str]) -> "JointAddresses":
-        """Look the joints up by name, in a model of the tendon or the rigid form."""
+        """Look up joints by name, in a model of the tendon or the rigid form."""
         link = [model.joint(name) for name in joints]
         known = {model.joint(i).name for i in range(model.njnt)}
         rotors = [motor_name(n) if motor_name(n) in known else n for n in joints]

@@ -1,7 +1,7 @@
 """Settings of elastic joints by name or pattern, in YAML or a mapping: K, servo, friction.
 
-This is the only reader of such files. `elastic_env/Robot-v0` and `baselines.PositionCompensator`
-take what it returns, so that a file means the same to both.
+This is the only reader of such files: a file means the same to `elastic_env/Robot-v0` and to
+`baselines.PositionCompensator`.
 """
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -22,26 +22,24 @@ GivenJoints = str | Path | Mapping[str, Any]
 the name of one of `SMALL_SERVOS`, "rigid" or "held".
 """
 HELD = "held"
-"""Value of a joint that nobody commands: it stays where the model's first keyframe has it."""
+"""Value of a joint that is not commanded: it stays at its angle of the model's first keyframe."""
 RIGID = "rigid"
 """Value of a joint without a spring; the same as an infinite stiffness."""
 SOFTEST = 1e-9
-"""Least stiffness and position gain; below it nothing is a joint, and 1/K is no number
-[N·m/rad].
-"""
+"""Least stiffness and position gain; below it 1/K may overflow [N·m/rad]."""
 CURE = (
     "K has no default. `elastic identify --robot MODEL --log poses.csv` identifies it from static"
     " poses and writes a file for `joints`; `elastic identify --robot MODEL --plan 20` proposes"
     " poses"
 )
-"""Source of a stiffness, for errors."""
+"""Advice on how to get a stiffness, for errors."""
 
 
 class ServoSettings(Model):
     """Known values of a servo; the rest comes from the model's actuator, or from defaults.
 
-    A position gain without an integral gain is a servo that gives way under a load. A servo of
-    which neither is said, and that the model has not either, holds its angle.
+    A servo with a position gain and no integral gain gives way under a load. A servo holds its
+    angle if neither the settings nor the model have these gains.
     """
 
     position_gain: float | None = quantity("N·m/rad", None, ge=SOFTEST)
@@ -65,7 +63,7 @@ class ServoSettings(Model):
 
     @property
     def braking(self) -> float:
-        """k_v and what the back-EMF adds to it, as far as they are known [N·m·s/rad]."""
+        """k_v and the damping by the back-EMF, as far as they are known [N·m·s/rad]."""
         return (self.velocity_gain or 0.0) + (0.0 if self.motor is None else self.motor.damping)
 
     @property
@@ -75,21 +73,20 @@ class ServoSettings(Model):
             return self.speed_limit
         return float("inf") if self.motor is None else self.motor.no_load_speed
 
-    def over(self, found: "ServoSettings") -> "ServoSettings":
-        """These settings where they say something, else what was found in the model.
+    def over(self, servo: "ServoSettings") -> "ServoSettings":
+        """Return these settings, completed by those of the model's servo.
 
-        A position gain that is given is that of another servo than the model's, of which nothing
-        but the limit is left.
+        A given position gain belongs to another servo: then the model's gains are not used.
         """
         if self.position_gain is not None:
             return self.replace(integral_gain=self.integral_gain or 0.0)
-        return found.replace(**self.model_dump(exclude_none=True))
+        return servo.replace(**self.model_dump(exclude_none=True))
 
     def sagging_gain(self, joint: str) -> float:
-        """k_p of a servo that gives way under a load; infinite for one that holds [N·m/rad].
+        """Return k_p of a servo that gives way under a load, infinity for one that holds [N·m/rad].
 
         Args:
-            joint: Whose servo it is, for the error.
+            joint: Its joint, for the error.
 
         Raises:
             ConfigurationError: It has no integrator, and its position gain is not known.
@@ -135,35 +132,35 @@ class JointSettings(FrictionTerms):
 def read_joints(
     given: GivenJoints, hinges: Sequence[str], others: Collection[str] = ()
 ) -> dict[str, JointSettings | None]:
-    """Settings of the hinges that are named, in the order of the model; None for one that is held.
+    """Return the settings of the named hinges, in the order of the model; None for a held one.
 
-    A name goes before patterns, and a later pattern before an earlier one. Hinges that nothing
-    names are left out.
+    A name goes before patterns, and a later pattern before an earlier one. Hinges without name and
+    pattern are left out.
 
     Args:
         given: File or mapping.
         hinges: Hinges of the model.
-        others: Its further joints, which may be held and nothing else.
+        others: Its further joints, which may only be held.
 
     Raises:
-        ConfigurationError: No file or mapping, a name or pattern of no joint, or a value that
-            cannot be.
+        ConfigurationError: No file or mapping, a name or pattern without a joint, or an invalid
+            value.
     """
     mapping = joint_mapping(given)
     for key, value in mapping.items():
-        known = [*hinges, *others] if _is(value, HELD) else hinges
+        known = [*hinges, *others] if _equals(value, HELD) else hinges
         if not isinstance(key, str) or not any(_fits(name, key) for name in known):
             raise unknown_name("joint or pattern of joints", key, hinges)
-    found: dict[str, JointSettings | None] = {}
+    settings: dict[str, JointSettings | None] = {}
     for name in hinges:
         key = key_of(mapping, name)
         if key is not None:
-            found[name] = _settings(name, mapping[key])
-    return found
+            settings[name] = _read_joint(name, mapping[key])
+    return settings
 
 
 def key_of(mapping: Iterable[str], name: str) -> str | None:
-    """The key for a joint: its name, else the last pattern that fits, or None."""
+    """Return the key for a joint: its name, else the last pattern that fits, or None."""
     fitting = [key for key in mapping if isinstance(key, str) and _fits(name, key)]
     return name if name in fitting else next(reversed(fitting), None)
 
@@ -172,12 +169,12 @@ def _fits(name: str, key: str) -> bool:
     return name == key or fnmatchcase(name, key)
 
 
-def _is(value: Any, word: str) -> bool:
+def _equals(value: Any, word: str) -> bool:
     return isinstance(value, str) and value == word
 
 
 def joint_mapping(given: GivenJoints) -> Mapping[str, Any]:
-    """The mapping that is given, or that a file holds.
+    """Return a given mapping, or read that of a file.
 
     Raises:
         ConfigurationError: It is neither, or the file holds none.
@@ -192,28 +189,24 @@ def joint_mapping(given: GivenJoints) -> Mapping[str, Any]:
     return read_mapping(Path(given))
 
 
-def _settings(name: str, value: Any) -> JointSettings | None:
-    """Settings of one joint."""
-    if _is(value, HELD):
+def _read_joint(name: str, value: Any) -> JointSettings | None:
+    """Convert the value of one joint to its settings, None for a held joint."""
+    if _equals(value, HELD):
         return None
     if isinstance(value, JointSettings):
         return value
     if isinstance(value, str) and value in SMALL_SERVOS:
         return JointSettings(**small_servo(value).model_dump())
-    own = (
-        value
-        if isinstance(value, Mapping)
-        else {"stiffness": np.inf if _is(value, RIGID) else value}
-    )
-    if own.get("stiffness") is None:
-        beside = f" beside {quote(list(own))}" if isinstance(value, Mapping) else ""
+    fields = value if isinstance(value, Mapping) else {"stiffness": value}
+    if fields.get("stiffness") is None:
+        beside = f" beside {quote(list(fields))}" if isinstance(value, Mapping) else ""
         raise ConfigurationError(
             f"stiffness of joint {name!r} is missing{beside}; write 'stiffness: K' [N·m/rad]: joint"
             f" {name!r} needs its stiffness K, or the value {HELD} or {RIGID}. {CURE}"
         )
-    if _is(own["stiffness"], RIGID):
-        own = {**own, "stiffness": np.inf}
-    settings: dict[str, Any] = {str(key): part for key, part in own.items()}
+    if _equals(fields["stiffness"], RIGID):
+        fields = {**fields, "stiffness": np.inf}
+    settings: dict[str, Any] = {str(key): part for key, part in fields.items()}
     try:
         return JointSettings(**settings)
     except ConfigurationError as error:

@@ -1,4 +1,4 @@
-"""Keyframes of a rigid specification, carried over to one with rotors and servos."""
+"""Transfer of the keyframes of a rigid specification to one with rotors and servos."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -10,10 +10,10 @@ from elastic_env.joint.joint_names import JointAddresses, servo_name
 
 @contextmanager
 def carry_keyframes(spec: mujoco.MjSpec, joints: Sequence[str]) -> Iterator[None]:
-    """Keep the keyframes while joints become elastic within.
+    """Keep the keyframes of a specification whose joints become elastic in the block.
 
-    Their vectors no longer fit then: they are removed, and added again with rotors at their link
-    angles and servos holding them.
+    Their vectors do not fit the elastic model. So they are removed first, and added again with
+    rotors at their link angles and servos that hold these angles.
     """
     if not spec.keys:
         yield
@@ -26,7 +26,7 @@ def carry_keyframes(spec: mujoco.MjSpec, joints: Sequence[str]) -> Iterator[None
     yield
     model = spec.compile()
     names = {actuator.name for actuator in spec.actuators}
-    kept = {  # the others are replaced by a servo
+    kept = {  # servos replace the others
         number: actuator.id
         for number, actuator in enumerate(actuators)
         if actuator.id >= 0 and actuator.name in names
@@ -40,9 +40,9 @@ def carry_keyframes(spec: mujoco.MjSpec, joints: Sequence[str]) -> Iterator[None
         for number, joint in enumerate(links):
             new.joint(joint.id).qpos = old.joint(number).qpos
             new.joint(joint.id).qvel = old.joint(number).qvel
-        for number, own in kept.items():
-            new.actuator(own).ctrl = old.actuator(number).ctrl
-            new.act[_states(model, own)] = old.act[_states(rigid, number)]
+        for number, actuator in kept.items():
+            new.actuator(actuator).ctrl = old.actuator(number).ctrl
+            new.act[_states(model, actuator)] = old.act[_states(rigid, number)]
         new.qpos[at.theta] = new.qpos[at.q]
         new.qvel[at.theta_dot] = new.qvel[at.q_dot]
         for name, q in zip(joints, new.qpos[at.q], strict=True):
@@ -61,6 +61,6 @@ def carry_keyframes(spec: mujoco.MjSpec, joints: Sequence[str]) -> Iterator[None
 
 
 def _states(model: mujoco.MjModel, actuator: int) -> slice:
-    """Columns of an actuator's own state in `act`; empty without one."""
+    """Return the columns of an actuator's state in `act`; none without a state."""
     first = int(model.actuator_actadr[actuator])
     return slice(first, first + int(model.actuator_actnum[actuator]))

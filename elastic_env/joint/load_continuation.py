@@ -1,4 +1,4 @@
-r"""Equilibria of links on soft springs, by a load that grows from zero.
+r"""Equilibria of links on soft springs, followed under a load that grows from zero.
 
 The link angle q at rest solves q = θ − C τ(q) with the compliance C = K⁻¹. Where the load bends a
 spring far, the equation may have several solutions, and Newton's steps from θ may fail or end at
@@ -20,17 +20,18 @@ TorqueFunction = Callable[[Array], Array]
 _MOST_STEPS = 200
 _MOST_NEWTON_STEPS = 12
 _FARTHEST_RAD = 0.5
-"""Largest way in one step: a longer one might leave the path."""
+"""Largest motion in one step: a larger one might leave the path."""
 _WOUND_RAD = np.pi
-"""Deflection of other equilibria that count, at most: half a turn of the spring."""
+"""Largest deflection of other equilibria that count: half a turn of the spring."""
 _SCANS = 96
+"""Angles of a joint at which other equilibria are searched."""
 _OTHER_RAD = 1e-2
-"""Least distance of two equilibria that count as two."""
+"""Least distance of two different equilibria."""
 
 
 @dataclass(frozen=True)
 class LoadPath:
-    """End of the path, one for each row.
+    """End of the path of each row.
 
     Attributes:
         q: Last stable link angles on the path, (..., n) [rad].
@@ -38,8 +39,8 @@ class LoadPath:
         joint: Joint that gives way most easily there, (...).
         other: Up to two other stable equilibria of that joint, nan where none is known, (..., 2)
             [rad].
-        lost: Rows without an equilibrium that is the only one, (..., 1). If there is one, others
-            may not be complete.
+        lost: Rows without a unique equilibrium, (..., 1). If one row is lost, others may be
+            incomplete.
     """
 
     q: Array
@@ -49,7 +50,7 @@ class LoadPath:
     lost: BoolArray
 
     def reason(self, compliance: Array, names: Sequence[str] | None = None) -> str:
-        """Sentences that say why the first lost row has no equilibrium, with the joint.
+        """Explain why the first lost row has no equilibrium, with the joint.
 
         Args:
             compliance: C, broadcast against (..., n) [rad/(N·m)].
@@ -62,15 +63,15 @@ class LoadPath:
         if names is not None:
             name = names[joint]
         question = f"is the stiffness of {name} ({K:.6g} N·m/rad) too low for its load?"
-        known = self.other[row][~np.isnan(self.other[row])]
-        others = [f"at {angle:.4g} rad" for angle in known]
+        angles = self.other[row][~np.isnan(self.other[row])]
+        others = [f"at {angle:.4g} rad" for angle in angles]
         if self.load[row] < 1.0:
-            there = "which pose it comes to rest in is not known"
+            rest = "which pose it comes to rest in is not known"
             if others:
-                there = f"it can rest {' and '.join(others)}"
+                rest = f"it can rest {' and '.join(others)}"
             return (
                 f"{question} At {100.0 * float(self.load[row][0]):.3g} % of the load K + ∂τ_g/∂q"
-                f" becomes singular: the link tips over, and {there}"
+                f" becomes singular: the link tips over, and {rest}"
             )
         here = f"at {self.q[(*row, joint)]:.4g} rad"
         return f"{question} The pose is bistable: the link can rest {' and '.join([here, *others])}"
@@ -89,7 +90,7 @@ def follow_load(
     names_rest: bool = True,
     finest: float = 1e-8,
 ) -> LoadPath:
-    """Follow the equilibrium from no load to the whole one.
+    """Follow the equilibrium from no load to the whole load.
 
     A row does not depend on the other rows.
 
@@ -101,9 +102,9 @@ def follow_load(
         tolerance: Largest residual of the equation that is accepted, beside 1 rad [rad].
         rows: Rows to follow, (..., 1); the others stay at θ with the whole load. None for all.
         within: Lowest and highest angles of other equilibria that count, (n,) each [rad].
-        unique: Whether to look for other equilibria.
-        names_rest: Whether to look where a link that tips over can rest.
-        finest: Share of the load in a step, at least. A path that needs smaller steps has ended.
+        unique: True to search for other equilibria.
+        names_rest: True to search where a link that tips over can rest.
+        finest: Least share of the load in a step. A path that needs smaller steps has ended.
     """
     C = np.broadcast_to(compliance, theta.shape)
     springs = _Springs(theta, C, torque, torque_gradient, tolerance)
@@ -150,7 +151,7 @@ class _Springs:
     tolerance: float
 
     def settle(self, start: Array, load: Array, rows: BoolArray) -> tuple[Array, BoolArray]:
-        """Equilibria under shares of the load by Newton's steps; rows with a stable one near."""
+        """Find equilibria under shares of the load by Newton's steps; True for stable ones."""
         C = load * self.compliance
         q = start
         is_good = rows
@@ -174,7 +175,7 @@ class _Springs:
         return q, is_good & is_done
 
     def softest(self, q: Array, load: Array) -> IntArray:
-        """Joint that moves most in the direction that gives way most easily, (...)."""
+        """Return the joint that moves most in the direction of least stiffness, (...)."""
         rows = np.ones_like(load, dtype=np.bool_)
         matrix = self._matrix(q, load * self.compliance, rows)
         values, vectors = np.linalg.eig(matrix)
@@ -185,9 +186,9 @@ class _Springs:
     def others(
         self, q: Array, rows: BoolArray, within: tuple[Array, Array] | None
     ) -> tuple[IntArray, Array]:
-        """Joints that can rest elsewhere, (...), and where, (..., 2), nan for none.
+        """Return joints that can rest elsewhere, (...), and their angles, (..., 2), nan for none.
 
-        They are found along each joint alone, then of all joints.
+        Each joint is searched alone; then all joints settle from there.
         """
         n = q.shape[-1]
         lowest, highest = within or (np.full(n, -np.inf), np.full(n, np.inf))
@@ -219,7 +220,7 @@ class _Springs:
         return joint, other
 
     def _crossings(self, q: Array, i: int) -> list[Array]:
-        """Angles of joint i at which spring and load balance while the others stay, or nan."""
+        """Return angles at which joint i balances while the others stay, nan for none."""
         moved = q.copy()
         values = []
         scan = np.linspace(-_WOUND_RAD, _WOUND_RAD, _SCANS)
@@ -239,7 +240,7 @@ class _Springs:
         return starts
 
     def _matrix(self, q: Array, C: Array, rows: BoolArray) -> Array:
-        """1 + C ∂τ/∂q of some rows, (..., n, n), and 1 of the others."""
-        own = np.eye(q.shape[-1]) + C[..., None] * self.torque_gradient(q)
-        is_finite = np.isfinite(own).all(axis=(-2, -1), keepdims=True)
-        return np.where(rows[..., None] & is_finite, own, np.eye(q.shape[-1]))
+        """Return 1 + C ∂τ/∂q for some rows, (..., n, n), and 1 for the others."""
+        matrix = np.eye(q.shape[-1]) + C[..., None] * self.torque_gradient(q)
+        is_finite = np.isfinite(matrix).all(axis=(-2, -1), keepdims=True)
+        return np.where(rows[..., None] & is_finite, matrix, np.eye(q.shape[-1]))

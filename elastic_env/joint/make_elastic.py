@@ -8,7 +8,8 @@ Two forms of the same joint:
   it.
 * `rigid`: no spring; the rotor's inertia is the hinge's armature.
 
-Friction acts on the link side of the spring, the servo and all actuators of the hinge on the rotor.
+Friction acts on the link side of the spring. The servo and all actuators of the hinge act on the
+rotor.
 """
 
 import warnings
@@ -18,32 +19,28 @@ from typing import Literal, get_args
 
 import mujoco
 import numpy as np
-from mujoco import MjsActuator, MjsBody, MjsJoint, MjSpec
+from mujoco import MjsBody, MjsJoint, MjSpec
 
 from elastic_env.core.errors import ConfigurationError, quote, require_known
 from elastic_env.core.signals import Array
 from elastic_env.joint import joint_names
-from elastic_env.joint.elasticity import ElasticJoint, Servo
-from elastic_env.joint.joint_names import motor_name, servo_name, spring_name
+from elastic_env.joint.compile_model import compile_spec
+from elastic_env.joint.elasticity import ElasticJoint
+from elastic_env.joint.joint_drive import BLANK, ActuatorRule, drive_joint
+from elastic_env.joint.joint_names import motor_name, spring_name
 from elastic_env.joint.keyframes import carry_keyframes
-from elastic_env.joint.model_file import compiled_spec, read_model
-from elastic_env.joint.motor import Motor
+from elastic_env.joint.model_file import read_model
 from elastic_env.joint.supported_models import require_few, require_flags, require_hinge
-from elastic_env.joint.time_step import is_stable, largest_stable_timestep, with_room
+from elastic_env.joint.time_step import is_stable, largest_stable_timestep, round_below
 from elastic_env.joint.varying_friction import add_terms, varies
 
 Form = Literal["tendon", "rigid"]
-ActuatorRule = Literal["keep", "replace"]
 
 _HINGE = mujoco.mjtJoint.mjJNT_HINGE
-_JOINT = mujoco.mjtTrn.mjTRN_JOINT
-_ON_JOINT = (_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
 _IMPLICITFAST = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-# MuJoCo wants mass on every moving body; the rotor's inertia is its joint's armature
+# MuJoCo needs mass on every moving body; the rotor's inertia is its joint's armature
 _ROTOR_MASS = 1e-12
-_BLANK = MjSpec()
-"""Its defaults are MuJoCo's own: those of a model must not leak into rotor, spring and servo."""
-# MuJoCo's default friction constraint creeps: it loses nearly all of 5 N·m within 10 s at rest
+# with MuJoCo's default constraint, friction creeps: at rest 5 N·m are nearly lost within 10 s
 _FRICTION_SOLREF = (0.001, 1.0)
 _FRICTION_SOLIMP = (0.9999, 0.9999, 0.001, 0.5, 2.0)
 
@@ -54,27 +51,27 @@ def make_elastic(
     form: Form = "tendon",
     actuators: ActuatorRule = "keep",
 ) -> MjSpec:
-    """A copy of a specification in which the named hinges are elastic.
+    """Return a copy of a specification in which the named hinges are elastic.
 
-    What a hinge had stays: limits, springs, damping and friction on the link (the joint's friction
-    is added to it), sensors and equalities on the link angle, actuators on the rotor. Its armature,
-    which stands for the rotor, is replaced by the rotor inertia. Keyframes get the rotors at their
-    link angles, without deflection.
+    A hinge keeps its limits, springs, damping and friction on the link (the joint's friction is
+    added), sensors and equalities on the link angle, and actuators on the rotor. The rotor inertia
+    replaces its armature, which stands for the rotor. Keyframes get the rotors at their link
+    angles, without deflection.
 
     The elastic model follows its springs at the physics step of the model. The integrator becomes
     `implicitfast` where the model's own does not follow them. MuJoCo's automatic reset is off, so
     that a divergence shows as NaN in the state and as a warning in `data.warning`. A model that
-    starts anew would look as if it were well. With dampers, `implicitfast` moves a joint as if
+    starts again would look healthy. With dampers, `implicitfast` moves a joint as if
     rotor and link each had the inertia D times the physics step more: choose a step for which that
     is small.
 
-    MuJoCo simulates whatever acts on the joints. So this function takes models that `Robot-v0` and
-    `PositionCompensator` refuse, since they have to know every torque in advance: floating bases
-    and ball joints; loops and other equality constraints; tendons that pull; drives by a tendon, a
-    site or a slider-crank; springs that are not linear; deformable bodies, plugins and wind; and a
-    flag that turns gravity off. What they refuse it for is in one place,
-    `elastic_env.joint.supported_models`. Nobody takes models that contradict themselves, that have
-    no hinge, or whose flags turn springs, dampers, the servo or the friction of the joints off.
+    MuJoCo simulates everything that acts on the joints. So this function takes models that
+    `Robot-v0` and `PositionCompensator` refuse, since these must know every torque in advance:
+    floating bases and ball joints; loops and other equality constraints; tendons that pull; drives
+    by a tendon, a site or a slider-crank; springs that are not linear; deformable bodies, plugins
+    and wind; and a flag that turns gravity off. `elastic_env.joint.supported_models` has their
+    checks. All three refuse models that contradict themselves, that have no hinge, or whose flags
+    turn springs, dampers, the servo or the friction of the joints off.
 
     Args:
         spec: Any specification with hinges, a file of MJCF or URDF, or the text of one, see
@@ -98,13 +95,13 @@ def make_elastic(
             actuators, or friction changes with load or speed, which needs a call before every step.
     """
     are_joints = isinstance(joints, Mapping)
-    if not are_joints or not all(isinstance(own, ElasticJoint) for own in joints.values()):
+    if not are_joints or not all(isinstance(joint, ElasticJoint) for joint in joints.values()):
         needed = "a mapping from names of hinges to ElasticJoint"
         raise ConfigurationError(f"joints must be {needed}, got {quote(joints)}")
     require_few(joints)
-    read = read_model(spec)
-    require_hinge(read.model)
-    elastic = transform_hinges(read.spec, joints, form, actuators)
+    rigid = read_model(spec)
+    require_hinge(rigid.model)
+    elastic = transform_hinges(rigid.spec, joints, form, actuators)
     elastic.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
     _choose_integrator(elastic)
     changing = [name for name, joint in joints.items() if varies(joint)]
@@ -124,9 +121,9 @@ def transform_hinges(
     form: Form = "tendon",
     actuators: ActuatorRule = "keep",
 ) -> MjSpec:
-    """`make_elastic` without a look at stability, for a caller that sets the physics step later.
+    """Make hinges elastic without a check of stability: the caller sets the physics step later.
 
-    The integrator and the automatic reset are those of the given specification.
+    Integrator and automatic reset stay as in the given specification.
     """
     require_known("form", [form], get_args(Form))
     require_known("actuator rule", [actuators], get_args(ActuatorRule))
@@ -140,7 +137,7 @@ def transform_hinges(
 
 
 def _require_flags(spec: MjSpec, joints: Mapping[str, ElasticJoint]) -> None:
-    """Refuse flags that turn off what the joints have."""
+    """Refuse flags that turn off a part of the joints."""
     needed = ["spring", "damper"]
     if any(joint.servo is not None for joint in joints.values()):
         needed.append("actuation")
@@ -150,11 +147,11 @@ def _require_flags(spec: MjSpec, joints: Mapping[str, ElasticJoint]) -> None:
 
 
 def _choose_integrator(spec: MjSpec) -> None:
-    """Take `implicitfast` where the model's own integrator does not follow the joints.
+    """Set `implicitfast` where the model's own integrator does not follow the joints.
 
-    Refuse the model if neither does.
+    Refuse the model if neither follows them.
     """
-    model = compiled_spec(spec, "the elastic model")
+    model = compile_spec(spec, "the elastic model")
     if is_stable(model):
         return
     own = mujoco.mjtIntegrator(model.opt.integrator).name.removeprefix("mjINT_")
@@ -164,7 +161,7 @@ def _choose_integrator(spec: MjSpec) -> None:
     if not is_stable(model):
         raise ConfigurationError(
             f"the elastic joints explode {step} with {names}; set spec.option.timestep to at most"
-            f" {with_room(largest_stable_timestep(model)):g} s before they are made elastic, or"
+            f" {round_below(largest_stable_timestep(model)):g} s before they are made elastic, or"
             " give them more damping"
         )
     spec.option.integrator = _IMPLICITFAST
@@ -177,10 +174,10 @@ def _choose_integrator(spec: MjSpec) -> None:
 
 def _resolve_springdampers(spec: MjSpec, joints: list[str]) -> None:
     """Write out springs that are given as time constants, which depend on the inertias."""
-    given = [j for j in spec.joints if j.name in joints and np.any(j.springdamper)]
-    if given:
-        model = compiled_spec(spec, "the specification")
-        for hinge in given:
+    hinges = [j for j in spec.joints if j.name in joints and np.any(j.springdamper)]
+    if hinges:
+        model = compile_spec(spec, "the specification")
+        for hinge in hinges:
             compiled = model.joint(hinge.name)
             hinge.stiffness = np.array([compiled.stiffness[0], 0.0, 0.0])
             hinge.damping = np.array([compiled.damping[0], 0.0, 0.0])
@@ -213,19 +210,17 @@ def _transform(
         _add_rotor(spec, hinge, joint)
         _add_spring(spec, name, joint)
     _add_friction(spec, hinge, joint)
-    _drive(spec, name, driven, joint.servo, rule)
-    _follow_actuators(spec, name, driven)
+    drive_joint(spec, name, driven, joint.servo, rule)
 
 
 def _rotor_body(spec: MjSpec, hinge: MjsJoint) -> MjsBody:
-    """A body for the rotor beside the link's.
+    """Add a body for the rotor beside the link's body.
 
-    Where it is does not matter: it has no mass, only the armature.
+    Its place does not matter: it has no mass, only the armature.
     """
     body = hinge.parent
     parent = body.parent if isinstance(body.parent, MjsBody) else spec.worldbody
-    # from a specification of its own, so that the model's defaults, units and bounds of mass do not
-    # apply to it
+    # attached from a new specification: the model's defaults, units and bounds of mass do not apply
     blank = MjSpec()
     blank.compiler.degree = hinge.compiler.degree
     rotor = blank.worldbody.add_body(
@@ -236,8 +231,7 @@ def _rotor_body(spec: MjSpec, hinge: MjsJoint) -> MjsBody:
         explicitinertial=True,
     )
     if spec.option.density > 0.0 or spec.option.viscosity > 0.0:
-        # without a geom, drag acts on the box of equal inertia, which for a massless rotor is as
-        # large as 2 m
+        # without a geom, drag acts on the box of equal inertia: 2 m large for a massless rotor
         rotor.add_geom(
             type=mujoco.mjtGeom.mjGEOM_SPHERE,
             size=[1e-9, 0.0, 0.0],
@@ -252,11 +246,11 @@ def _rotor_body(spec: MjSpec, hinge: MjsJoint) -> MjsBody:
 
 
 def _add_rotor(spec: MjSpec, hinge: MjsJoint, joint: ElasticJoint) -> None:
-    """The rotor's hinge."""
-    # not enforced, so not converted; for actuators that inherit their range
-    limits = _in_radians(hinge, hinge.range)
+    """Add the rotor's hinge."""
+    # not enforced, so not converted: only actuators that inherit their range use it
+    limits = _to_radians(hinge, hinge.range)
     rotor = _rotor_body(spec, hinge).add_joint(
-        _BLANK.default,
+        BLANK.default,
         name=motor_name(hinge.name),
         type=_HINGE,
         pos=hinge.pos,
@@ -270,21 +264,21 @@ def _add_rotor(spec: MjSpec, hinge: MjsJoint, joint: ElasticJoint) -> None:
         actfrcrange=hinge.actfrcrange,
         group=hinge.group,
     )
-    # of an attached model the unit may differ from the rotor's
-    ref = float(_in_radians(hinge, hinge.ref))
+    # an attached model may have another unit than the rotor
+    ref = float(_to_radians(hinge, hinge.ref))
     rotor.ref = rotor.springref = np.rad2deg(ref) if rotor.compiler.degree else ref
     hinge.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
     hinge.actfrcrange = np.zeros(2)
 
 
-def _in_radians(hinge: MjsJoint, angle: Array) -> Array:
-    """An angle of the specification, which may be written in degrees, in radians."""
+def _to_radians(hinge: MjsJoint, angle: Array) -> Array:
+    """Convert an angle of the specification, which may be in degrees, to radians."""
     return np.deg2rad(angle) if hinge.compiler.degree else np.array(angle)
 
 
 def _add_spring(spec: MjSpec, name: str, joint: ElasticJoint) -> None:
-    """The spring as a tendon of length θ − q."""
-    spring = spec.add_tendon(_BLANK.default, name=spring_name(name))
+    """Add the spring as a tendon of length θ − q."""
+    spring = spec.add_tendon(BLANK.default, name=spring_name(name))
     spring.wrap_joint(motor_name(name), 1.0)
     spring.wrap_joint(name, -1.0)
     spring.stiffness = np.array([joint.stiffness, 0.0, 0.0])
@@ -293,7 +287,7 @@ def _add_spring(spec: MjSpec, name: str, joint: ElasticJoint) -> None:
 
 
 def _add_friction(spec: MjSpec, hinge: MjsJoint, joint: ElasticJoint) -> None:
-    """Friction on the link angle, on top of what the hinge has."""
+    """Add the joint's friction to that of the hinge."""
     hinge.damping = hinge.damping + np.array([joint.viscous_friction, 0.0, 0.0])
     hinge.frictionloss += joint.coulomb_friction
     if varies(joint):
@@ -301,86 +295,3 @@ def _add_friction(spec: MjSpec, hinge: MjsJoint, joint: ElasticJoint) -> None:
     if joint.coulomb_friction > 0.0 or varies(joint):
         hinge.solref_friction[:] = _FRICTION_SOLREF
         hinge.solimp_friction[:] = _FRICTION_SOLIMP
-
-
-def _drive(spec: MjSpec, name: str, driven: str, servo: Servo | None, rule: ActuatorRule) -> None:
-    """Put the hinge's actuators, or the servo, on the driven joint."""
-    on_joints = [a for a in spec.actuators if a.trntype in _ON_JOINT]
-    existing = [actuator for actuator in on_joints if actuator.target == name]
-    for actuator in existing:
-        if rule == "replace":
-            _redirect_sensors(spec, actuator.name, name, servo is not None)
-            spec.delete(actuator)
-        else:
-            actuator.target = driven
-    if servo is not None and (rule == "replace" or not existing):
-        _add_servo(spec, servo_name(name), driven, servo)
-    elif servo is not None:
-        kept = ", ".join(repr(actuator.name) for actuator in existing)
-        warnings.warn(
-            f"the hinge {name!r} keeps its actuator {kept}, so that its servo is left out; choose"
-            " actuators='replace' for the servo in its place, or give the joint servo=None",
-            stacklevel=4,
-        )
-
-
-def _follow_actuators(spec: MjSpec, name: str, driven: str) -> None:
-    """Sensors of the actuator torque on a hinge go where its actuators go."""
-    kind = mujoco.mjtSensor.mjSENS_JOINTACTFRC
-    for sensor in spec.sensors:
-        if sensor.type == kind and sensor.objname == name:
-            sensor.objname = driven
-
-
-def _redirect_sensors(spec: MjSpec, actuator: str, joint: str, has_servo: bool) -> None:
-    """Sensors of an actuator that is replaced read the servo instead."""
-    kind = mujoco.mjtObj.mjOBJ_ACTUATOR
-    of_actuators = [sensor for sensor in spec.sensors if sensor.objtype == kind]
-    sensors = [sensor for sensor in of_actuators if sensor.objname == actuator]
-    if sensors and not has_servo:
-        raise ConfigurationError(
-            f"sensor {sensors[0].name!r} reads the actuator {actuator!r}, which is to be replaced;"
-            f" give the joint {joint!r} a servo, or delete the sensor"
-        )
-    for sensor in sensors:
-        sensor.objname = servo_name(joint)
-
-
-def _add_servo(spec: MjSpec, name: str, target: str, servo: Servo) -> None:
-    actuator = spec.add_actuator(_BLANK.default, name=name, target=target, trntype=_JOINT)
-    if servo.motor is None:
-        actuator.set_to_pid(
-            kp=servo.position_gain,
-            kv=servo.velocity_gain,
-            ki=servo.integral_gain,
-            imax=servo.integral_limit,
-            ctrlspec=int(mujoco.mjtCtrlInput.mjINPUT_POS),
-        )
-    else:
-        _set_to_motor(actuator, servo, servo.motor)
-    actuator.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE
-    actuator.forcerange = np.array([-servo.torque_limit, servo.torque_limit])
-
-
-def _set_to_motor(actuator: MjsActuator, servo: Servo, motor: Motor) -> None:
-    """MuJoCo's DC motor with the servo's PID on its voltage.
-
-    MuJoCo has one motor constant K = k_t = k_e, of a gear without losses. With K = sqrt(k_t k_e)
-    and the voltage scaled by sqrt(k_t / k_e), torque at rest and back-EMF are those of the motor.
-    Its controller takes the back-EMF off the torque, as a driver that controls the current does;
-    the velocity gain gives it back.
-    """
-    limit = motor.voltage * motor.pwm_limit
-    actuator.set_to_dcmotor(
-        motorconst=[np.sqrt(motor.torque_constant * motor.back_emf), 0.0],
-        resistance=motor.resistance,
-        controller=[
-            servo.position_gain,
-            servo.integral_gain,
-            servo.braking,
-            0.0,
-            servo.integral_limit,
-            limit * np.sqrt(motor.torque_constant / motor.back_emf),
-        ],
-        ctrlspec=int(mujoco.mjtCtrlInput.mjINPUT_POS),
-    )

@@ -1,6 +1,6 @@
-"""Bounds of a model, counted on its XML before MuJoCo builds it.
+"""Bounds of a model, checked on its XML before MuJoCo builds it.
 
-A small file must not ask for much time or memory.
+A small file must not use much time or memory.
 """
 
 import math
@@ -24,11 +24,11 @@ from elastic_env.joint.model_text import (
 MOST_JOINTS = 500
 MOST_BODIES = 2_000
 MOST_ELEMENTS = 20_000
-"""Elements of a model, each with as many copies as <replicate> and <attach> make of it."""
+"""Elements of a model, with the copies that <replicate> and <attach> make."""
 MOST_PIXELS = 2**28
-"""Of all pictures of a model together."""
+"""Pixels of all pictures of a model together."""
 MOST_ASSET_BYTES = 500_000_000
-"""Of all meshes and pictures of a model together."""
+"""Size of all meshes and pictures of a model together."""
 
 FOLDERS = ("meshdir", "texturedir", "assetdir")
 """Attributes of <compiler> that name a folder of files."""
@@ -40,13 +40,13 @@ _LARGEST = [
     (row["tag"], row["attributes"].split(), int(row["most"]))
     for row in read_rows(Path(__file__).with_suffix(".csv"))
 ]
-"""Attributes of elements, and the largest products of their magnitudes."""
+"""Elements, some of their attributes, and the largest product of the magnitudes of these."""
 _PREFIXES = ("nuser_", "iterations", "_iterations", "_initpoints")
-_MOST_OF_OTHERS = 10_000
+_LARGEST_PRODUCT = 10_000
 _UNITS = {"K": 2**10, "M": 2**20, "G": 2**30, "T": 2**40, "P": 2**50, "E": 2**60}
 _MOST_MEMORY = 2**30
-_FINEST = 300
-"""Resolution of a mesh that MuJoCo makes; it has as many vertices squared."""
+_FINEST_MESH = 300
+"""Largest resolution of a mesh that MuJoCo makes: the vertices grow with its square."""
 _SHORTEST_STEP_S = 1e-5
 _PNG = b"\x89PNG\r\n\x1a\n"
 
@@ -55,7 +55,7 @@ def require_bounds(model: ModelText) -> None:
     """Refuse a model that is larger than any robot.
 
     Raises:
-        ConfigurationError: A count, a size or a file is beyond its bound, or files include one
+        ConfigurationError: A count, a size or a file exceeds its bound, or files include one
             another in a circle.
     """
     counts = _Counts(model)
@@ -67,7 +67,7 @@ def require_bounds(model: ModelText) -> None:
 
 @dataclass
 class _Counts:
-    """Counts of a model, so far."""
+    """Running counts of a model."""
 
     model: ModelText
     elements: float = 0.0
@@ -75,32 +75,32 @@ class _Counts:
     joints: float = 0.0
     pixels: float = 0.0
     asset_bytes: int = 0
-    _assets: set[Path] = field(default_factory=set)
+    _counted_assets: set[Path] = field(default_factory=set)
     _attached: dict[str, ET.Element] = field(default_factory=dict)
     _folders: list[str] = field(default_factory=lambda: [""])
 
     def add_urdf(self, robot: ET.Element) -> None:
-        """Count a URDF, whose links nest in MuJoCo as they are joined."""
-        self._bound("elements", sum(1 for _ in robot.iter()), MOST_ELEMENTS)
-        self._bound("bodies", len(robot.findall("link")), MOST_BODIES)
+        """Count the parts of a URDF."""
+        self._require_at_most("elements", sum(1 for _ in robot.iter()), MOST_ELEMENTS)
+        self._require_at_most("bodies", len(robot.findall("link")), MOST_BODIES)
         joints = robot.findall("joint")
         moving = [joint for joint in joints if joint.get("type") != "fixed"]
-        self._bound("joints", len(moving), MOST_JOINTS)
+        self._require_at_most("joints", len(moving), MOST_JOINTS)
         for element in robot.iter():
             self._require_numbers(element)
         for mesh in robot.iter("mesh"):
             self._add_asset(mesh.get("filename", "").removeprefix("file://"))
 
     def add(self, root: ET.Element, files: Files) -> None:
-        """Count a document of MJCF; `files` are those in which it is included."""
-        self._add_folders(root)
-        self._walk(root, files, 1.0, in_world=False, depth=len(files))
+        """Count the parts of a document of MJCF; `files` are those that include it."""
+        self._note_folders(root)
+        self._count(root, files, 1.0, in_world=False, depth=len(files))
 
-    def _add_folders(self, root: ET.Element) -> None:
+    def _note_folders(self, root: ET.Element) -> None:
         for compiler in root.iter("compiler"):
             self._folders += [compiler.get(key, "") for key in FOLDERS]
 
-    def _walk(
+    def _count(
         self,
         element: ET.Element,
         files: Files,
@@ -122,18 +122,18 @@ class _Counts:
             copies *= max(_number(element.get("count", "1")), 1.0)
         in_world = in_world or tag in _WORLD
         self.elements += copies
-        self._bound("elements", self.elements, MOST_ELEMENTS)
+        self._require_at_most("elements", self.elements, MOST_ELEMENTS)
         if tag == "body":
             self.bodies += copies
-            self._bound("bodies", self.bodies, MOST_BODIES)
+            self._require_at_most("bodies", self.bodies, MOST_BODIES)
         if in_world and tag in _JOINTS:
             self.joints += copies
-            self._bound("joints", self.joints, MOST_JOINTS)
+            self._require_at_most("joints", self.joints, MOST_JOINTS)
         self._require_numbers(element)
         if tag == "include":
             self._include(element.get("file", ""), files, copies, in_world, depth)
         elif tag == "model":
-            self._attachable(element, files)
+            self._add_attachable(element, files)
         elif tag == "attach":
             self._attach(element, files, copies, depth)
         else:
@@ -142,21 +142,21 @@ class _Counts:
                 if is_asset and key.startswith("file"):
                     self._add_asset(value)
         for part in element:
-            self._walk(part, files, copies, in_world, depth + 1)
+            self._count(part, files, copies, in_world, depth + 1)
 
     def _include(self, name: str, files: Files, copies: float, in_world: bool, depth: int) -> None:
-        root, path = self._document(name, files)
+        root, path = self._read_document(name, files)
         if root is not None:
-            self._add_folders(root)
+            self._note_folders(root)
             for part in root:
-                self._walk(part, (*files, path), copies, in_world, depth + 1)
+                self._count(part, (*files, path), copies, in_world, depth + 1)
 
-    def _attachable(self, element: ET.Element, files: Files) -> None:
+    def _add_attachable(self, element: ET.Element, files: Files) -> None:
         name = element.get("file", "")
-        root, path = self._document(name, files)
+        root, path = self._read_document(name, files)
         if root is not None:
             self._attached[element.get("name") or Path(name).stem] = root
-            self._walk(root, (*files, path), 1.0, in_world=False, depth=len(files) + 1)
+            self._count(root, (*files, path), 1.0, in_world=False, depth=len(files) + 1)
 
     def _attach(self, element: ET.Element, files: Files, copies: float, depth: int) -> None:
         root = self._attached.get(element.get("model", ""))
@@ -164,10 +164,10 @@ class _Counts:
             name = element.get("body")
             bodies = [body for body in root.iter("body") if body.get("name") == name]
             for body in bodies or root.findall("worldbody"):
-                self._walk(body, files, copies, in_world=True, depth=depth + 1)
+                self._count(body, files, copies, in_world=True, depth=depth + 1)
 
-    def _document(self, name: str, files: Files) -> tuple[ET.Element | None, Path]:
-        """A further file of the model; None where MuJoCo will say that it is missing."""
+    def _read_document(self, name: str, files: Files) -> tuple[ET.Element | None, Path]:
+        """Read a further file of the model; None for a missing one, which MuJoCo refuses later."""
         folders = [self.model.folder, *(file.parent for file in files[-1:])]
         paths = [folder / name for folder in folders if _exists(folder / name)]
         if not paths or not name:
@@ -181,27 +181,25 @@ class _Counts:
         return parse_xml(text, name_of(path)), path
 
     def _add_asset(self, name: str) -> None:
-        """Count a mesh or picture, which must be a regular file of bounded size.
-
-        One that is missing is judged later.
-        """
+        """Count a mesh or picture, which must be a regular file of bounded size, or missing."""
         for folder in self._folders:
             path = self.model.folder / folder / name
-            if not name or path in self._assets or not _exists(path):
+            if not name or path in self._counted_assets or not _exists(path):
                 continue
-            self._assets.add(path)
-            facts = path.stat()
-            if stat.S_ISDIR(facts.st_mode):
+            self._counted_assets.add(path)
+            status = path.stat()
+            if stat.S_ISDIR(status.st_mode):
                 continue
-            if not stat.S_ISREG(facts.st_mode):
+            if not stat.S_ISREG(status.st_mode):
                 problem = f"names {name_of(path)}, which is no regular file"
                 raise ConfigurationError(f"{self.model.name} {problem}")
-            self._bound(f"bytes of {name_of(name)}", facts.st_size, LARGEST_BYTES)
-            self.asset_bytes += facts.st_size
-            what = "bytes of meshes and pictures"
-            self._bound(what, self.asset_bytes, MOST_ASSET_BYTES)
+            self._require_at_most(f"bytes of {name_of(name)}", status.st_size, LARGEST_BYTES)
+            self.asset_bytes += status.st_size
+            self._require_at_most(
+                "bytes of meshes and pictures", self.asset_bytes, MOST_ASSET_BYTES
+            )
             self.pixels += _pixels(path)
-            self._bound("pixels of pictures", self.pixels, MOST_PIXELS)
+            self._require_at_most("pixels of pictures", self.pixels, MOST_PIXELS)
 
     def _require_numbers(self, element: ET.Element) -> None:
         tag = element.tag
@@ -209,12 +207,13 @@ class _Counts:
         for of_tag, names, most in _LARGEST:
             if of_tag in ("", tag) and any(name in values for name in names):
                 numbers = [n for name in names for n in _numbers(values.get(name, ""))]
-                what = f"{' times '.join(names)} of <{tag}>"
-                self._bound(what, _product(numbers), most)
+                self._require_at_most(
+                    f"{' times '.join(names)} of <{tag}>", _product(numbers), most
+                )
         for name, value in values.items():
             if name.startswith(_PREFIXES[:1]) or name.endswith(_PREFIXES[1:]):
                 product = _product(_numbers(value))
-                self._bound(f"{name} of <{tag}>", product, _MOST_OF_OTHERS)
+                self._require_at_most(f"{name} of <{tag}>", product, _LARGEST_PRODUCT)
             if name != "name" and _has_nan(value):
                 raise ConfigurationError(
                     f"{name} of <{tag}> in {self.model.name} must be numbers, got {quote(value)}"
@@ -222,13 +221,14 @@ class _Counts:
         if tag == "texture" and {"width", "height"} <= set(values):
             sizes = [*_numbers(values["width"]), *_numbers(values["height"])]
             self.pixels += _product(sizes)
-            self._bound("pixels of pictures", self.pixels, MOST_PIXELS)
+            self._require_at_most("pixels of pictures", self.pixels, MOST_PIXELS)
         if tag == "mesh" and "params" in values:
-            finest = max(_numbers(values["params"]), default=0.0)
-            self._bound("as params of a mesh", finest, _FINEST)
+            resolution = max(_numbers(values["params"]), default=0.0)
+            self._require_at_most("as params of a mesh", resolution, _FINEST_MESH)
         if tag == "size" and "memory" in values:
-            memory = _bytes(values["memory"])
-            self._bound("memory of <size> [bytes]", memory, _MOST_MEMORY)
+            self._require_at_most(
+                "memory of <size> [bytes]", _bytes(values["memory"]), _MOST_MEMORY
+            )
         if tag == "lengthrange" and "timestep" in values:
             step = _number(values["timestep"])
             if not step >= _SHORTEST_STEP_S:
@@ -236,7 +236,7 @@ class _Counts:
                 name = self.model.name
                 raise ConfigurationError(f"timestep of <lengthrange> in {name} {needed}")
 
-    def _bound(self, what: str, value: float, most: float) -> None:
+    def _require_at_most(self, what: str, value: float, most: float) -> None:
         if not value <= most:
             raise ConfigurationError(
                 f"{self.model.name} must have at most {most:.15g} {what}, copies counted, it has"
@@ -252,7 +252,7 @@ def _exists(path: Path) -> bool:
 
 
 def _number(text: str) -> float:
-    """A number of an attribute; 0 where it is none, which MuJoCo refuses."""
+    """Convert an attribute to a number; 0 where it is none, which MuJoCo refuses."""
     try:
         value = float(text)
     except ValueError:
@@ -265,7 +265,7 @@ def _numbers(text: str) -> list[float]:
 
 
 def _product(numbers: list[float]) -> float:
-    """Of the magnitudes; what is below one does not make a product smaller."""
+    """Return the product of magnitudes; those below one count as one."""
     return math.prod(max(number, 1.0) for number in numbers)
 
 
@@ -279,14 +279,14 @@ def _has_nan(text: str) -> bool:
 
 
 def _bytes(text: str) -> float:
-    """Bytes of a size such as "64M"."""
+    """Convert a size such as "64M" to bytes."""
     text = text.strip()
     unit = _UNITS.get(text[-1:].upper(), 1)
     return abs(_number(text[:-1] if unit > 1 else text)) * unit
 
 
 def _pixels(path: Path) -> int:
-    """Pixels that a PNG declares; 0 for other files."""
+    """Return the pixels that a PNG declares; 0 for other files."""
     with path.open("rb") as file:
         head = file.read(24)
     if not head.startswith(_PNG) or len(head) < 24:

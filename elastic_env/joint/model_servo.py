@@ -1,4 +1,4 @@
-"""The drive of a joint by a model's actuators: gains, rotor inertia, limits."""
+"""Drive of a joint by the actuators of a model: servo gains, rotor inertia, torque limits."""
 
 from dataclasses import dataclass
 
@@ -15,10 +15,10 @@ _ON_JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARE
 
 @dataclass(frozen=True)
 class ModelServo:
-    """The position servo of a joint, as the model has it.
+    """Position servo of a joint in a model.
 
     Attributes:
-        settings: Gains at the joint. There is no velocity gain where nothing damps it.
+        settings: Gains at the joint. Without any damping there is no velocity gain.
         joint_damping: Part of the velocity gain that is the `damping` of the joint [N·m·s/rad].
     """
 
@@ -27,14 +27,15 @@ class ModelServo:
 
 
 def position_servo(model: MjModel, joint: str) -> ModelServo | None:
-    """The model's position actuator of a joint, by its gear on the joint; None where there is none.
+    """Return the model's position servo of a joint, with gains behind the gear; None for none.
 
-    A damper or a velocity actuator beside it, whose command is zero, is part of the velocity gain.
-    So is the `damping` of the joint, if it is more than these: it is what damps the servo in models
-    without a `kv`, and no friction.
+    A further damper or velocity actuator, whose command is zero, is part of the velocity gain. So
+    is the `damping` of the joint, if it exceeds these: in models without a `kv` it damps the servo,
+    and is no friction.
 
     Raises:
-        ConfigurationError: There are several, or it has a law that a `Servo` has not.
+        ConfigurationError: There are several position actuators, or one with another law than a
+            `Servo`.
     """
     actuators = _actuators(model, joint)
     if (model.actuator_gaintype[actuators] == mujoco.mjtGain.mjGAIN_DCMOTOR).any():
@@ -45,7 +46,7 @@ def position_servo(model: MjModel, joint: str) -> ModelServo | None:
         )
     position = [i for i in actuators if model.actuator_biasprm[i, 1] != 0.0]
     if not position:
-        return None  # a motor or a velocity servo: a position servo takes its place
+        return None  # a position servo replaces a motor or a velocity servo
     i = position[0]
     gear = float(model.actuator_gear[i, 0])
     gain = model.actuator_gainprm[i]
@@ -56,9 +57,9 @@ def position_servo(model: MjModel, joint: str) -> ModelServo | None:
     ki = float(gain[0]) if is_pid else 0.0
     is_filtered = not is_pid and model.actuator_dyntype[i] != mujoco.mjtDyn.mjDYN_NONE
     is_fixed = model.actuator_gaintype[i] == mujoco.mjtGain.mjGAIN_FIXED
-    is_plain = is_pid or (is_fixed and np.isclose(gain[0], kp))
-    is_one = len(position) == 1 and not is_filtered and is_plain
-    if not is_one or bias[0] != 0.0 or kp <= 0.0 or kv < 0.0 or gear == 0.0:
+    is_position_law = is_pid or (is_fixed and np.isclose(gain[0], kp))
+    is_servo = len(position) == 1 and not is_filtered and is_position_law
+    if not is_servo or bias[0] != 0.0 or kp <= 0.0 or kv < 0.0 or gear == 0.0:
         raise ConfigurationError(
             f"the actuators of joint {joint!r} are no single position servo of the form kp (u - q)"
             " - kv q_dot; say its position_gain, velocity_gain and integral_gain under `servo` of"
@@ -76,18 +77,18 @@ def position_servo(model: MjModel, joint: str) -> ModelServo | None:
 
 
 def rotor_inertia(model: MjModel, joint: str) -> float:
-    """Armature of a joint and of the actuators on it, 0 where there is none [kg·m²]."""
+    """Return the armature of a joint and of the actuators on it, 0 for none [kg·m²]."""
     actuators = _actuators(model, joint)
     gears = model.actuator_gear[actuators, 0]
-    of_actuators = (gears**2 * model.actuator_armature[actuators]).tolist()
-    return float(model.joint(joint).armature[0] + sum(of_actuators))
+    armatures = (gears**2 * model.actuator_armature[actuators]).tolist()
+    return float(model.joint(joint).armature[0] + sum(armatures))
 
 
 def force_limit(model: MjModel, joint: str) -> float | None:
-    """Torque limit of a joint and its actuators [N·m]; None where the model has none.
+    """Return the torque limit of a joint and its actuators [N·m]; None where the model has none.
 
     Raises:
-        ConfigurationError: A range leaves no torque in one direction.
+        ConfigurationError: A range allows no torque in one direction.
     """
     number = model.joint(joint).id
     limits = [(1.0, model.jnt_actfrclimited[number], model.jnt_actfrcrange[number])]
@@ -99,37 +100,36 @@ def force_limit(model: MjModel, joint: str) -> float | None:
         is_unbiased = model.actuator_biastype[i] == mujoco.mjtBias.mjBIAS_NONE
         if is_fixed and is_unbiased and model.actuator_dyntype[i] == 0:
             gain = gear * abs(float(model.actuator_gainprm[i, 0]))
-            at = model.actuator_ctrladr[i]  # actuators before may have several commands
+            at = model.actuator_ctrladr[i]  # earlier actuators may have several commands
             limits.append((gain, model.actuator_ctrllimited[at], model.actuator_ctrlrange[at]))
-    found = [_bound(joint, *limit) for limit in limits]
-    return min((value for value in found if value is not None), default=None)
+    torques = [_smaller_end(joint, *limit) for limit in limits]
+    return min((torque for torque in torques if torque is not None), default=None)
 
 
 def _actuators(model: MjModel, joint: str) -> list[int]:
-    """Actuators that act on a joint."""
+    """Return the actuators on a joint."""
     number = model.joint(joint).id
     is_on_joint = np.isin(model.actuator_trntype, _ON_JOINT)
-    is_on_it = is_on_joint & (model.actuator_trnid[:, 0] == number)
-    return np.flatnonzero(is_on_it).tolist()
+    return np.flatnonzero(is_on_joint & (model.actuator_trnid[:, 0] == number)).tolist()
 
 
 def _braking(model: MjModel, joint: str) -> float:
-    """Damping by a joint's actuators at zero command, without its position servo [N·m·s/rad]."""
+    """Return the damping by a joint's actuators, except its position servo [N·m·s/rad]."""
     braking = 0.0
     for i in _actuators(model, joint):
-        own = float(model.actuator_damping[i])
+        damping = float(model.actuator_damping[i])
         has_state = model.actuator_dyntype[i] != mujoco.mjtDyn.mjDYN_NONE
         if model.actuator_biasprm[i, 1] == 0.0 and not has_state:
-            own += max(-float(model.actuator_biasprm[i, 2]), 0.0)
-        braking += float(model.actuator_gear[i, 0]) ** 2 * own
+            damping += max(-float(model.actuator_biasprm[i, 2]), 0.0)
+        braking += float(model.actuator_gear[i, 0]) ** 2 * damping
     return braking
 
 
-def _bound(joint: str, scale: float, is_limited: bool, interval: Array) -> float | None:
-    """The smaller end of an interval about zero [N·m]; None where it is no limit.
+def _smaller_end(joint: str, scale: float, is_limited: bool, interval: Array) -> float | None:
+    """Return the smaller end of an interval about zero, scaled [N·m]; None if it is no limit.
 
     Raises:
-        ConfigurationError: It leaves no torque in one direction.
+        ConfigurationError: The interval allows no torque in one direction.
     """
     if not is_limited:
         return None

@@ -1,7 +1,7 @@
-"""The XML of a model in MJCF or URDF, read within bounds before MuJoCo sees it.
+"""Reader of the XML of a model in MJCF or URDF, within bounds, before MuJoCo reads it.
 
-Prefixes that nobody declares are read as MuJoCo and ROS read them. What would have to be expanded
-first (xacro, entities) is refused.
+Undeclared prefixes are accepted, as MuJoCo and ROS do. Text that must be expanded first (xacro,
+entities) is refused.
 """
 
 import codecs
@@ -17,29 +17,29 @@ from elastic_env.core.errors import ConfigurationError, quote
 from elastic_env.core.files import read_bounded
 
 LARGEST_BYTES = 50_000_000
-"""Of a model's file, and of its text."""
+"""Largest size of a model's file, and of its text."""
 DEEPEST = 200
-"""Elements within one another."""
+"""Largest depth of elements within one another."""
 LONGEST_NAME = 200
-"""Characters of a name or path that an error prints."""
+"""Characters of a name or path that an error shows."""
 
 _BLANK = "\ufeff \t\r\n"
 _KINDS = ("mujoco", "robot")
 _FILE = "give a file of MJCF (.xml) or URDF (.urdf)"
 _DECLARED = re.compile(rb"""^\s*<\?xml[^>]{0,200}?encoding\s*=\s*["']([A-Za-z0-9._-]{1,40})["']""")
 _DECLARATION = re.compile(r"^<\?xml[^>]*\?>")
-_MARKS = (
+_BYTE_ORDER_MARKS = (
     (codecs.BOM_UTF8, "utf-8-sig"),
     (codecs.BOM_UTF32_LE, "utf-32"),
     (codecs.BOM_UTF32_BE, "utf-32"),
     (codecs.BOM_UTF16_LE, "utf-16"),
     (codecs.BOM_UTF16_BE, "utf-16"),
 )
-_NOT_OF_FILES = "idna punycode unicode_escape raw_unicode_escape undefined mbcs oem"
+_NO_FILE_ENCODINGS = "idna punycode unicode_escape raw_unicode_escape undefined mbcs oem"
 _XACRO = "xacro"
 _EXPAND = "expand it first: xacro arm.urdf.xacro > arm.urdf"
 _XACRO_PARTS = {"property", "macro", "include", "insert_block", "if", "unless", "arg"}
-"""Children of a robot that old files of xacro have without prefix."""
+"""Children of <robot> that old files of xacro have without prefix."""
 _PLACEHOLDER = re.compile(r"\$[{(]")
 
 
@@ -49,11 +49,11 @@ class ModelText:
 
     Attributes:
         root: Its root, <mujoco> or <robot>. Prefixes are part of the tags.
-        name: What errors call it.
-        folder: Where files that it names are looked for.
+        name: Its name in errors.
+        folder: Folder of the files that it names.
         file: Its file; None for a text.
-        text: The text itself, without mark and encoding.
-        is_utf8: Whether the file is in UTF-8, which MuJoCo reads by itself.
+        text: The text, without byte order mark and decoded.
+        is_utf8: True if the file is in UTF-8, which MuJoCo reads by itself.
     """
 
     root: ET.Element
@@ -70,10 +70,10 @@ class ModelText:
 
 
 def read_model_text(model: str | Path) -> ModelText:
-    """A file of MJCF or URDF, or the text of one.
+    """Read a file of MJCF or URDF, or the text of one.
 
     Raises:
-        ConfigurationError: There is no such file, it is too large, no XML or no model, or it has to
+        ConfigurationError: There is no such file, it is too large, no XML or no model, or it must
             be expanded first.
     """
     if is_text(model):
@@ -84,31 +84,35 @@ def read_model_text(model: str | Path) -> ModelText:
                 f"{name} must have at most {LARGEST_BYTES} characters, it has {len(text)}"
             )
         root = parse_xml(text, name)
-        found = ModelText(root, name, Path.cwd(), None, text, is_utf8=True)
+        model_text = ModelText(root, name, Path.cwd(), None, text, is_utf8=True)
     else:
-        found = _of_file(Path(model))
-    _require_model(found)
-    return found
+        path = Path(model)
+        name = name_of(path)
+        text, is_utf8 = decode_xml(read_bytes(path), name)
+        root = parse_xml(text, name)
+        model_text = ModelText(root, name, path.resolve().parent, path, text, is_utf8)
+    _require_model(model_text)
+    return model_text
 
 
 def is_text(model: object) -> bool:
-    """True if a model is given as its text rather than as a file."""
+    """Return True for the text of a model, False for a file."""
     return isinstance(model, str) and model.lstrip(_BLANK).startswith("<")
 
 
 def without_declaration(text: str) -> str:
-    """The text of a model for a file in UTF-8: without mark and declared encoding."""
+    """Return the text of a model without byte order mark and declared encoding, for UTF-8."""
     return _DECLARATION.sub("", text.lstrip(_BLANK), count=1)
 
 
 def name_of(path: str | Path) -> str:
-    """A path as errors show it: as it is, or shortened and escaped."""
+    """Return a path as errors show it: as it is, or shortened and escaped."""
     text = str(path)
     return text if len(text) <= LONGEST_NAME and text.isprintable() else quote(text)
 
 
 def read_bytes(path: Path, what: str = "model") -> bytes:
-    """Content of a regular file of bounded size; nothing else is opened.
+    """Read a regular file of bounded size; nothing else is opened.
 
     Raises:
         ConfigurationError: It is no regular file, is too large, or cannot be read.
@@ -128,7 +132,7 @@ def read_bytes(path: Path, what: str = "model") -> bytes:
 
 
 def parse_xml(text: str, name: str) -> ET.Element:
-    """The elements and attributes of an XML text of bounded depth; `name` is what errors call it.
+    """Parse an XML text of bounded depth; `name` is its name in errors.
 
     Raises:
         ConfigurationError: It is no XML, is nested too deeply, or declares entities.
@@ -141,8 +145,7 @@ def parse_xml(text: str, name: str) -> ET.Element:
         depth += 1
         if depth > DEEPEST:
             problem = f"{name} must be nested at most {DEEPEST} elements deep"
-            cure = f"line {parser.CurrentLineNumber} is deeper"
-            raise ConfigurationError(f"{problem}; {cure}")
+            raise ConfigurationError(f"{problem}; line {parser.CurrentLineNumber} is deeper")
         tree.start(tag, attributes)
 
     def end(tag: str) -> None:
@@ -168,17 +171,9 @@ def parse_xml(text: str, name: str) -> ET.Element:
         raise ConfigurationError(f"{name} is no XML: {error}; {_FILE}") from None
 
 
-def _of_file(path: Path) -> ModelText:
-    name = name_of(path)
-    content = read_bytes(path)
-    text, is_utf8 = decode_xml(content, name)
-    root = parse_xml(text, name)
-    return ModelText(root, name, path.resolve().parent, path, text, is_utf8)
-
-
 def decode_xml(content: bytes, name: str) -> tuple[str, bool]:
-    """The text of a file by its mark or declared encoding, and whether that is UTF-8."""
-    encoding = next((own for mark, own in _MARKS if content.startswith(mark)), None)
+    """Decode a file by its byte order mark or declared encoding; True if that is UTF-8."""
+    encoding = next((name for mark, name in _BYTE_ORDER_MARKS if content.startswith(mark)), None)
     if encoding is None:
         declared = _DECLARED.match(content)
         encoding = declared.group(1).decode("ascii") if declared else "utf-8"
@@ -186,7 +181,10 @@ def decode_xml(content: bytes, name: str) -> tuple[str, bool]:
             encoding = "utf-16-le" if content[0] else "utf-16-be"
     try:
         codec = codecs.lookup(encoding)
-        if not codec._is_text_encoding or codec.name.replace("-", "_") in _NOT_OF_FILES.split():  # type: ignore[attr-defined]
+        if (
+            not codec._is_text_encoding
+            or codec.name.replace("-", "_") in _NO_FILE_ENCODINGS.split()
+        ):  # type: ignore[attr-defined]
             raise LookupError
         text = content.decode(encoding)
     except LookupError:
@@ -200,10 +198,10 @@ def decode_xml(content: bytes, name: str) -> tuple[str, bool]:
     return text.lstrip("\ufeff"), codec.name in ("utf-8", "utf-8-sig", "ascii")
 
 
-def _require_model(found: ModelText) -> None:
-    """Refuse what is neither MJCF nor URDF, and what xacro would expand."""
-    root = found.root
-    name = found.name
+def _require_model(model: ModelText) -> None:
+    """Refuse XML that is neither MJCF nor URDF, and text that xacro has to expand."""
+    root = model.root
+    name = model.name
     aliases = {_XACRO} | {
         key.removeprefix("xmlns:")
         for key, value in root.attrib.items()
@@ -213,20 +211,20 @@ def _require_model(found: ModelText) -> None:
         for key in (element.tag, *element.attrib):
             prefix, colon, _ = key.partition(":")
             if colon and prefix in aliases:
-                what = f"<{key}>" if key == element.tag else f"the attribute {key}"
-                problem = f"{name} is a file of xacro, it has {quote(what)[1:-1]}"
+                part = f"<{key}>" if key == element.tag else f"the attribute {key}"
+                problem = f"{name} is a file of xacro, it has {quote(part)[1:-1]}"
                 raise ConfigurationError(f"{problem}; {_EXPAND}")
     if root.tag not in _KINDS:
         raise ConfigurationError(
             f"the root of {name} must be <mujoco> or <robot>, got {quote(root.tag)}; {_FILE}"
         )
-    if found.is_urdf:
-        for element in _parts(root):
+    if model.is_urdf:
+        for element in _robot_parts(root):
             values = element.attrib.values()
-            unread = [value for value in values if _PLACEHOLDER.search(value)]
-            if unread:
+            placeholders = [value for value in values if _PLACEHOLDER.search(value)]
+            if placeholders:
                 raise ConfigurationError(
-                    f"{name} has {quote(unread[0])} in <{element.tag}>, of xacro; {_EXPAND}"
+                    f"{name} has {quote(placeholders[0])} in <{element.tag}>, of xacro; {_EXPAND}"
                 )
         old = next((part.tag for part in root if part.tag in _XACRO_PARTS), None)
         if old is not None:
@@ -234,8 +232,8 @@ def _require_model(found: ModelText) -> None:
             raise ConfigurationError(f"{problem}; {_EXPAND}")
 
 
-def _parts(robot: ET.Element) -> Iterator[ET.Element]:
-    """Elements that describe the robot, not a simulator of it."""
+def _robot_parts(robot: ET.Element) -> Iterator[ET.Element]:
+    """Yield the elements of a URDF that describe the robot, not a simulator."""
     yield robot
     for part in robot:
         if part.tag in ("link", "joint"):

@@ -1,10 +1,10 @@
-r"""The DC motor of a servo, as the output shaft feels it.
+r"""The DC motor of a servo, at the output shaft.
 
     τ = k_t (V u − k_e ω) / R,   |u| ≤ u_max
 
-with the duty cycle u of the pulse-width modulation. All constants are behind the gear: with a gear
-ratio N and its efficiency η, those of the bare motor times N η for torque and times N for the
-back-EMF. The inductance is left out: its time constant L/R is well below a millisecond.
+with the duty cycle u of the pulse-width modulation. All constants are behind the gear. With a gear
+ratio N and its efficiency η, k_t is N η times that of the bare motor, and k_e is N times. The
+inductance is left out: its time constant L/R is well below a millisecond.
 """
 
 import numpy as np
@@ -39,7 +39,7 @@ class Motor(Model):
 
     @property
     def damping(self) -> float:
-        """Torque that the back-EMF takes per speed, k_t k_e / R [N·m·s/rad]."""
+        """Loss of torque per speed by the back-EMF, k_t k_e / R [N·m·s/rad]."""
         return self.torque_constant * self.back_emf / self.resistance
 
 

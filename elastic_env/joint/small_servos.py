@@ -24,7 +24,7 @@ per rad of error, half of what the e-manual says of the X series.
 | MX-106, 12 V | M3 | M3 | M3; 32 | 50.4 |
 | XM430-W350, 12 V | sheet: 4.1 N·m, 2.3 A, 4.82 rad/s | as MX-64, assumed | e-manual: PWM 885, 1/128; 800 | 22.5 |
 
-Assumed for all: K = 20 k_p, as the encoder sits behind the gear and sees what that gives; D by a
+Assumed for all: K = 20 k_p, as the encoder sits behind the gear and measures its bending; D by a
 damping ratio of 0.17; no Stribeck term, no velocity gain. The factory's integral gain is 0, so that
 these servos sag.
 
@@ -42,23 +42,20 @@ from elastic_env.joint.elasticity import ElasticJoint, Servo
 from elastic_env.joint.motor import Motor
 
 _COUNTS_PER_TURN = 4096
-_TO_SERVO = 20.0
+_STIFFNESS_PER_GAIN = 20.0
 """K over k_p, assumed."""
 _DAMPING_RATIO = 0.17
-
-_Given = float | None
-"""A gain or a voltage [V]; None for the usual one."""
 
 
 @dataclass(frozen=True)
 class SmallServo:
-    """A servo as its sources have it, at the output shaft.
+    """Figures of a servo from its sources, at the output shaft.
 
     Attributes:
-        motor: At the usual supply.
+        motor: Its motor at the usual supply.
         rotor_inertia: B [kg·m²].
         base: F', dry friction without load [N·m].
-        share: s, of the torques on both sides of the gear that is lost to friction [1].
+        share: s, share of the torques on both sides of the gear that is lost to friction [1].
         viscous: Viscous friction [N·m·s/rad].
         per_gain: κ, duty cycle per register of the position gain and rad [1/rad].
         gain: The factory's register of the position gain [1].
@@ -72,12 +69,12 @@ class SmallServo:
     per_gain: float
     gain: float
 
-    def joint(self, gain: _Given = None, voltage: _Given = None) -> ElasticJoint:
-        """The elastic joint with this servo; arguments as of `small_servo`."""
+    def joint(self, gain: float | None = None, voltage: float | None = None) -> ElasticJoint:
+        """Return the elastic joint with this servo; arguments as in `small_servo`."""
         motor = self.motor if voltage is None else self.motor.replace(voltage=voltage)
-        at_rest = motor.torque_constant * motor.voltage / motor.resistance
-        position_gain = at_rest * self.per_gain * (self.gain if gain is None else gain)
-        stiffness = _TO_SERVO * position_gain
+        torque_per_duty = motor.torque_constant * motor.voltage / motor.resistance
+        position_gain = torque_per_duty * self.per_gain * (self.gain if gain is None else gain)
+        stiffness = _STIFFNESS_PER_GAIN * position_gain
         swing = float(np.sqrt(stiffness * self.rotor_inertia))
         return ElasticJoint(
             stiffness=stiffness,
@@ -96,25 +93,25 @@ class SmallServo:
         )
 
 
-def _servo_of(row: dict[str, str]) -> SmallServo:
+def _read_servo(row: dict[str, str]) -> SmallServo:
     figures = {column: float(value) for column, value in row.items() if column != "name"}
     motor = Motor(**{name: figures.pop(name) for name in Motor.model_fields})
     return SmallServo(motor, **figures)
 
 
 SMALL_SERVOS = {
-    row["name"]: _servo_of(row) for row in read_rows(Path(__file__).with_suffix(".csv"))
+    row["name"]: _read_servo(row) for row in read_rows(Path(__file__).with_suffix(".csv"))
 }
 """Small servos by name."""
 
 
-def small_servo(name: str, gain: _Given = None, voltage: _Given = None) -> ElasticJoint:
-    """The elastic joint of a named servo.
+def small_servo(name: str, gain: float | None = None, voltage: float | None = None) -> ElasticJoint:
+    """Return the elastic joint of a named servo.
 
     Args:
         name: One of `SMALL_SERVOS`.
-        gain: Register of the position gain; default the factory's [1].
-        voltage: Supply; default the usual one [V].
+        gain: Register of the position gain; None for the factory's [1].
+        voltage: Supply; None for the usual one [V].
 
     Raises:
         ConfigurationError: An unknown name, or a gain or voltage that is not positive.

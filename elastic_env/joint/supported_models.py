@@ -1,150 +1,59 @@
-"""Judgement of a model for compensators: which joints move, and what else acts on them.
+"""Checks of a model for compensators: its joints, and everything else that acts on them.
 
-Everything that a model has is either part of the torque at rest, held, or refused with its name.
+Every element of a model is part of the torque at rest, is held, or is refused with its name.
 """
 
-import warnings
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Sequence
 
 import mujoco
 import numpy as np
 from mujoco import MjModel
 
 from elastic_env.core.errors import ConfigurationError, quote, require_known
-from elastic_env.core.signals import Array
-from elastic_env.joint.model_file import require_sound
+from elastic_env.joint.affected_joints import (
+    SITE,
+    SLIDERCRANK,
+    TENDON,
+    active_equalities,
+    equality_joints,
+    remote_actuator_joints,
+    tendon_joints,
+    tendon_pulls,
+)
+from elastic_env.joint.compile_model import require_sound
+from elastic_env.joint.model_joints import (
+    first_names,
+    hinge_ids,
+    hinges_of,
+    home_of,
+    mass_matrix,
+    nameless_hinge,
+)
 
 MOST_ELASTIC = 80
-"""Joints that are commanded; whether the physics follows them takes a time that grows with their
-cube.
-"""
+"""Largest number of elastic joints: the time of the stability check grows with their cube."""
 
 _HINGE = int(mujoco.mjtJoint.mjJNT_HINGE)
 _SLIDE = int(mujoco.mjtJoint.mjJNT_SLIDE)
-_WRAP_JOINT = int(mujoco.mjtWrap.mjWRAP_JOINT)
-_WRAP_SITE = int(mujoco.mjtWrap.mjWRAP_SITE)
-_WRAP_GEOMS = (int(mujoco.mjtWrap.mjWRAP_SPHERE), int(mujoco.mjtWrap.mjWRAP_CYLINDER))
-_EQ_JOINT = int(mujoco.mjtEq.mjEQ_JOINT)
-_EQ_TENDON = int(mujoco.mjtEq.mjEQ_TENDON)
-_TENDON = int(mujoco.mjtTrn.mjTRN_TENDON)
-_SITE = int(mujoco.mjtTrn.mjTRN_SITE)
-_SLIDERCRANK = int(mujoco.mjtTrn.mjTRN_SLIDERCRANK)
 _RESTING = ("gravity", "spring", "damper", "actuation")
-"""Flags of <option> that take away what bends a joint at rest, or what brings it there."""
+"""Flags of <option> whose forces bend a joint at rest, or bring it to rest."""
 _FLAGS = {
     name: int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{name.upper()}"))
-    for name in (*_RESTING, "frictionloss", "equality", "constraint")
+    for name in (*_RESTING, "frictionloss", "constraint")
 }
-"""Flags that say whether something acts on a joint, and their bits."""
+"""Flags of forces on a joint, and their bits."""
 _POSES = (0.0, 0.37, -0.83)
-"""Offsets from the home pose at which two joints about one axis would still have one axis [rad]."""
+"""Offsets from the home pose [rad]: two joints on one axis share it in each of these poses."""
 _SINGULAR = 1e-10
-
-
-def hinges_of(model: MjModel) -> list[str]:
-    """Names of all hinges with a name, in the order of the model."""
-    return [name for j in _hinges(model) if (name := model.joint(j).name)]
-
-
-def has_nameless_hinge(model: MjModel) -> bool:
-    """True if a hinge has no name, by which its stiffness could be given."""
-    return any(not model.joint(j).name for j in _hinges(model))
-
-
-def nameless_hinge() -> ConfigurationError:
-    """The error for a hinge without a name that is to be elastic."""
-    return ConfigurationError(
-        "a hinge of the model has no name; give each one, the stiffness is by name, or name the"
-        " joints that are elastic: the others are held"
-    )
-
-
-def commanded_hinges(model: MjModel, named: Collection[str] = ()) -> list[str]:
-    """Hinges that are commanded where nobody says which: all but fingers that the model couples.
-
-    Args:
-        model: Compiled rigid model.
-        named: Joints that somebody names, which are commanded in any case.
-
-    Raises:
-        ConfigurationError: See `require_robot`; or a hinge has no name.
-
-    Warns:
-        UserWarning: Fingers are held.
-    """
-    require_robot(model)
-    if has_nameless_hinge(model):
-        raise nameless_hinge()
-    return without_fingers(model, hinges_of(model), named)
-
-
-def without_fingers(model: MjModel, joints: Iterable[str], named: Collection[str]) -> list[str]:
-    """The joints without the fingers that the model couples and that nobody names.
-
-    Arguments as in `commanded_hinges`.
-    """
-    joints = list(joints)
-    coupled = [name for name in coupled_fingers(model) if name not in named]
-    fingers = [name for name in coupled if name in joints]
-    if fingers:
-        warnings.warn(
-            f"{_listed(fingers)} are coupled in the model (mimic), and are held, unlike all others",
-            stacklevel=5,
-        )
-    return [name for name in joints if name not in fingers]
-
-
-def coupled_fingers(model: MjModel) -> list[str]:
-    """Hinges of fingers that follow one another: coupled by equalities, side by side at the end.
-
-    Two fingers are on different branches, and carry no other joint. Loops may close within them.
-    Coupled joints within the arm are none, nor are loops without joints that are coupled, as of a
-    parallelogram.
-    """
-    groups: list[set[int]] = []
-    coupled: set[int] = set()
-    for e in _active(model):
-        acts, _ = _equality(model, e)
-        if len(acts) > 1:
-            joined = [group for group in groups if group & acts]
-            apart = [group for group in groups if not group & acts]
-            groups = [*apart, acts.union(*joined)]
-        if len(acts) > 1 and model.eq_type[e] == _EQ_JOINT:
-            coupled |= acts
-    hands = [group for group in groups if group & coupled and _is_gripper(model, group)]
-    fingers = set().union(*hands)
-    names = [model.joint(j).name for j in _hinges(model) if j in fingers]
-    return [name for name in names if name]
-
-
-def home_of(model: MjModel) -> Array:
-    """Positions of the joints in the first keyframe, or the model's reference, (nq,) [rad], [m]."""
-    return model.key_qpos[0].copy() if model.nkey else model.qpos0.copy()
-
-
-def held_positions(model: MjModel, joints: Sequence[str]) -> dict[int, float]:
-    """Positions at home of all joints but these, by their numbers [rad], [m]."""
-    home = home_of(model)
-    others = [j for j in range(model.njnt) if model.joint(j).name not in joints]
-    return {j: float(home[model.jnt_qposadr[j]]) for j in others}
-
-
-def mass_matrix(model: MjModel, data: mujoco.MjData) -> Array:
-    """Inertia of all joints with armature at the positions of a state, (nv, nv) [kg·m²]."""
-    mujoco.mj_kinematics(model, data)
-    mujoco.mj_comPos(model, data)
-    mujoco.mj_crb(model, data)
-    full = np.zeros((model.nv, model.nv))
-    mujoco.mj_fullM(model, data, full)
-    return full
+"""Least eigenvalue of the scaled inertia of the links; below it a joint has no inertia."""
 
 
 def require_robot(model: MjModel) -> None:
-    """Refuse a model of which no joint can be commanded, whatever is said of its joints.
+    """Refuse a model without joints that can be commanded, for any settings of its joints.
 
     Raises:
-        ConfigurationError: It contradicts itself; a joint is free or a ball joint, as of a base
-            that floats; or no hinge has a name.
+        ConfigurationError: It contradicts itself; a joint is free or a ball joint, as that of a
+            floating base; or no hinge has a name.
     """
     require_sound(model, "the model")
     for j in range(model.njnt):
@@ -158,12 +67,12 @@ def require_robot(model: MjModel) -> None:
 
 
 def require_hinge(model: MjModel) -> None:
-    """Refuse a model of which no joint can be elastic.
+    """Refuse a model without joints that can be elastic.
 
     Raises:
         ConfigurationError: It has no hinge, or none with a name.
     """
-    if not _hinges(model):
+    if not hinge_ids(model):
         raise ConfigurationError(
             "the model has no hinge, and elastic joints are hinges; give a robot with rotary joints"
         )
@@ -179,19 +88,18 @@ def require_few(joints: Collection[str]) -> None:
     """
     if len(joints) > MOST_ELASTIC:
         problem = f"at most {MOST_ELASTIC} joints can be elastic, got {len(joints)}"
-        cure = "name those that matter"
-        raise ConfigurationError(f"{problem}; {cure}")
+        raise ConfigurationError(f"{problem}; name those that matter")
 
 
 def require_flags(disabled: int, flags: Collection[str]) -> None:
-    """Refuse flags of a model that take away what its elastic joints need.
+    """Refuse a model that disables forces that its elastic joints need.
 
     Args:
-        disabled: Its flags that are disabled, a bit each.
-        flags: Those that must not be.
+        disabled: Disabled flags of the model, a bit each.
+        flags: Flags that must be enabled.
 
     Raises:
-        ConfigurationError: One of them is.
+        ConfigurationError: One of them is disabled.
     """
     for flag in flags:
         if disabled & _FLAGS[flag]:
@@ -205,11 +113,11 @@ def require_flags(disabled: int, flags: Collection[str]) -> None:
 
 
 def require_known_torque(model: MjModel, joints: Sequence[str]) -> None:
-    """Refuse a model in which something acts on the commanded joints that is not known in advance.
+    """Refuse a model whose commanded joints feel a torque that is not known in advance.
 
     Args:
         model: Compiled rigid model.
-        joints: Hinges that are commanded; all others are held.
+        joints: Commanded hinges; all others are held.
 
     Raises:
         ConfigurationError: See `require_robot`; a joint does not exist, is no hinge or is named
@@ -219,28 +127,29 @@ def require_known_torque(model: MjModel, joints: Sequence[str]) -> None:
     require_robot(model)
     ids = _ids_of(model, joints)
     require_flags(int(model.opt.disableflags), _RESTING)
-    _require_no_others(model)
-    for e in _active(model):
-        acts, ends = _equality(model, e)
-        if acts & ids:
+    _require_no_body_forces(model)
+    for e in active_equalities(model):
+        affected, ends = equality_joints(model, e)
+        if affected & ids:
             raise ConfigurationError(
                 f"the model has an equality constraint of {ends}, whose torque is not known in"
-                f" advance; take it out of the model{_or_hold(model, acts & ids, ids)}"
+                f" advance; take it out of the model{_hold_cure(model, affected & ids, ids)}"
             )
     for t in range(model.ntendon):
-        if _pulls(model, t) and (acts := _joints_of_tendon(model, t) & ids):
+        if tendon_pulls(model, t) and (affected := tendon_joints(model, t) & ids):
             raise ConfigurationError(
                 f"the model's tendon {model.tendon(t).name!r} has stiffness, damping, friction or"
                 " inertia; the torque of tendons with stiffness is not compensated; take it out of"
-                f" the model{_or_hold(model, acts, ids)}"
+                f" the model{_hold_cure(model, affected, ids)}"
             )
     for a in range(model.nactuator):
-        if acts := _driven_beside_joints(model, a) & ids:
+        if affected := remote_actuator_joints(model, a) & ids:
+            names = first_names([model.joint(j).name for j in sorted(affected)])
             raise ConfigurationError(
-                f"the model's actuator {model.actuator(a).name!r} drives {_names(model, acts)} by"
+                f"the model's actuator {model.actuator(a).name!r} drives {names} by"
                 f" {_TRANSMISSIONS[int(model.actuator_trntype[a])]}, which is not compensated;"
                 " drive each joint by an actuator of its own, or take this one out of the"
-                f" model{_or_hold(model, acts, ids)}"
+                f" model{_hold_cure(model, affected, ids)}"
             )
     for j in np.flatnonzero(model.jnt_stiffnesspoly.any(axis=-1)):
         if int(j) in ids:
@@ -251,13 +160,7 @@ def require_known_torque(model: MjModel, joints: Sequence[str]) -> None:
     _require_inertia(model, joints)
 
 
-_PULLING = "stiffness stiffnesspoly damping frictionloss armature"
-"""Properties by which a tendon pulls."""
-_TRANSMISSIONS = {_TENDON: "a tendon", _SITE: "a site", _SLIDERCRANK: "a slider-crank"}
-
-
-def _hinges(model: MjModel) -> list[int]:
-    return [j for j in range(model.njnt) if model.jnt_type[j] == _HINGE]
+_TRANSMISSIONS = {TENDON: "a tendon", SITE: "a site", SLIDERCRANK: "a slider-crank"}
 
 
 def _ids_of(model: MjModel, joints: Sequence[str]) -> set[int]:
@@ -276,8 +179,8 @@ def _ids_of(model: MjModel, joints: Sequence[str]) -> set[int]:
     return {known[name] for name in joints}
 
 
-def _require_no_others(model: MjModel) -> None:
-    """Refuse what acts on all links."""
+def _require_no_body_forces(model: MjModel) -> None:
+    """Refuse deformable bodies, plugins and wind, which act on all links."""
     unknown = "are not known in advance; take it out"
     if model.nflex:
         raise ConfigurationError(
@@ -293,91 +196,11 @@ def _require_no_others(model: MjModel) -> None:
         )
 
 
-def _active(model: MjModel) -> Iterator[int]:
-    """Equality constraints that act from the start."""
-    if not int(model.opt.disableflags) & (_FLAGS["equality"] | _FLAGS["constraint"]):
-        yield from (e for e in range(model.neq) if model.eq_active0[e])
-
-
-def _equality(model: MjModel, equality: int) -> tuple[set[int], str]:
-    """Joints that feel an equality constraint, and the names of what it couples."""
-    kind = int(model.eq_type[equality])
-    both = (model.eq_obj1id[equality], model.eq_obj2id[equality])
-    ends = [int(i) for i in both if i >= 0]
-    if kind == _EQ_JOINT:
-        acts = set(ends)
-        element = model.joint
-    elif kind == _EQ_TENDON:
-        acts = set().union(*(_joints_of_tendon(model, t) for t in ends))
-        element = model.tendon
-    elif model.eq_objtype[equality] == mujoco.mjtObj.mjOBJ_SITE:
-        acts = _between(model, [int(model.site_bodyid[site]) for site in ends])
-        element = model.site
-    elif model.eq_objtype[equality] == mujoco.mjtObj.mjOBJ_BODY:
-        acts = _between(model, [*ends, 0][:2])
-        element = model.body
-    else:
-        return set(range(model.njnt)), "a deformable body"
-    names = [quote(element(i).name)[1:-1] or f"number {i}" for i in ends]
-    return acts, " and ".join(names)
-
-
-def _chain(model: MjModel, body: int) -> set[int]:
-    """Joints between a body and the world."""
-    joints: set[int] = set()
-    while body > 0:
-        first = int(model.body_jntadr[body])
-        joints.update(range(first, first + int(model.body_jntnum[body])))
-        body = int(model.body_parentid[body])
-    return joints
-
-
-def _between(model: MjModel, bodies: Sequence[int]) -> set[int]:
-    """Joints that move bodies against one another."""
-    chains = [_chain(model, body) for body in bodies]
-    return set().union(*(chain ^ chains[0] for chain in chains))
-
-
-def _joints_of_tendon(model: MjModel, tendon: int) -> set[int]:
-    """Joints with which the length of a tendon changes."""
-    joints: set[int] = set()
-    bodies: list[int] = []
-    first = int(model.tendon_adr[tendon])
-    for at in range(first, first + int(model.tendon_num[tendon])):
-        kind = int(model.wrap_type[at])
-        one = int(model.wrap_objid[at])
-        if kind == _WRAP_JOINT:
-            joints.add(one)
-        elif kind == _WRAP_SITE:
-            bodies.append(int(model.site_bodyid[one]))
-        elif kind in _WRAP_GEOMS:
-            bodies.append(int(model.geom_bodyid[one]))
-    return joints | _between(model, bodies)
-
-
-def _pulls(model: MjModel, tendon: int) -> bool:
-    fields = [getattr(model, f"tendon_{name}") for name in _PULLING.split()]
-    return any(np.any(values[tendon]) for values in fields)
-
-
-def _driven_beside_joints(model: MjModel, actuator: int) -> set[int]:
-    """Joints that an actuator moves without being on one of them."""
-    kind = int(model.actuator_trntype[actuator])
-    first, second = (int(i) for i in model.actuator_trnid[actuator])
-    if kind == _TENDON:
-        return _joints_of_tendon(model, first)
-    if kind in (_SITE, _SLIDERCRANK):
-        sites = [site for site in (first, second) if site >= 0]
-        bodies = [int(model.site_bodyid[site]) for site in sites]
-        return _between(model, [*bodies, 0][:2])
-    return set()
-
-
-def _or_hold(model: MjModel, acts: set[int], moving: set[int]) -> str:
-    """How to hold the joints that something acts on, where others are left."""
-    if acts == moving:
+def _hold_cure(model: MjModel, affected: set[int], moving: set[int]) -> str:
+    """Describe how to hold the affected joints; empty where no other joint is left."""
+    if affected == moving:
         return ""
-    names = [model.joint(j).name for j in sorted(acts)]
+    names = [model.joint(j).name for j in sorted(affected)]
     lines = ", ".join(f"'{name}: held'" for name in names[:8])
     more = ", ..." if len(names) > 8 else ""
     return (
@@ -387,26 +210,8 @@ def _or_hold(model: MjModel, acts: set[int], moving: set[int]) -> str:
     )
 
 
-def _names(model: MjModel, joints: set[int]) -> str:
-    return _listed([model.joint(j).name for j in sorted(joints)])
-
-
-def _listed(names: Sequence[str]) -> str:
-    return ", ".join(names[:8]) + (", ..." if len(names) > 8 else "")
-
-
-def _is_gripper(model: MjModel, group: set[int]) -> bool:
-    """True if coupled joints are fingers: on two branches or more, with no joint beyond them."""
-    body_of = model.jnt_bodyid.tolist()
-    parent_of = model.body_parentid.tolist()
-    bodies = {body_of[j] for j in group}
-    carried = {j for j in range(model.njnt) if _chain(model, body_of[j]) & group}
-    first = [body for body in bodies if not _chain(model, parent_of[body]) & group]
-    return carried <= group and len(first) > 1 and len(group) < model.njnt
-
-
 def _require_inertia(model: MjModel, joints: Sequence[str]) -> None:
-    """Refuse joints that move no inertia of their own, such as two about one axis."""
+    """Refuse joints that move no inertia of their own, such as two joints on one axis."""
     data = mujoco.MjData(model)
     at = [int(model.joint(name).id) for name in joints]
     dofs = model.jnt_dofadr[at]

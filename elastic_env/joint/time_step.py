@@ -1,10 +1,10 @@
 r"""Stability of MuJoCo's integrator with the springs, dampers and servos of a model.
 
 Near rest a step of the physics is linear, :math:`x_{k+1} = A x_k`, and stable if no eigenvalue of A
-lies outside the unit circle. Of a semi-implicit step (Euler, implicitfast) that means ωh < 2 for a
-spring without damper whose frequency is ω, of RK4 ωh < 2.83. A comes from differences of MuJoCo's
-own step, so that every integrator, every inertia and every servo is seen as it is. Left out are
-contacts, limits, dry friction and dead bands, which only hold a joint back.
+lies outside the unit circle. For a spring without damper, of frequency ω, a semi-implicit step
+(Euler, implicitfast) needs ωh < 2, and RK4 ωh < 2.83. A comes from differences of MuJoCo's
+own step, with every integrator, every inertia and every servo. Contacts, limits, dry friction and
+dead bands are left out, as they only hold a joint back.
 """
 
 import copy
@@ -14,38 +14,36 @@ import numpy as np
 
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
-from elastic_env.joint.model_file import without_log_file
+from elastic_env.joint.compile_model import without_log_file
 
 _ROOM = 1.1
-"""By how much a physics step must be below the limit in the reference posture: inertias change
-with the posture.
+"""Least ratio of the limit in the reference posture to a physics step: inertias change with the
+posture.
 """
 _LARGEST_RADIUS = 1.0 + 1e-3
-"""Largest eigenvalue that counts as stable; those of a free body are 1, up to the error of the
-differences.
-"""
+"""Largest stable eigenvalue: those of a free body are 1, up to the error of the differences."""
 _DIFFERENCE = 1e-6
 _HALVINGS = 24
 _LEFT_OUT = [
-    int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{what}"))
-    for what in ("CONTACT", "LIMIT", "GRAVITY", "AUTORESET")
+    int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{flag}"))
+    for flag in ("CONTACT", "LIMIT", "GRAVITY", "AUTORESET")
 ]
-"""Flags of what holds a joint back, and of the reset that would hide a step without numbers."""
+"""Flags of forces that hold a joint back, and of the reset that would hide a NaN."""
 
 
 def spectral_radius(model: mujoco.MjModel, timestep_s: float) -> float:
-    """Largest eigenvalue of a physics step about the reference posture, by magnitude [1].
+    """Return the largest eigenvalue of a physics step about the reference, by magnitude [1].
 
     Args:
         model: It is not changed.
         timestep_s: Physics step [s].
 
     Returns:
-        At most 1 for a stable step; infinite where a step gives no number.
+        At most 1 for a stable step; infinite where a step gives NaN.
     """
     linear = _without_constraints(model)
     linear.opt.timestep = timestep_s
-    with without_log_file(without_console=True):  # a step that explodes is an answer
+    with without_log_file(without_console=True):  # a step that explodes is a result
         A = _transition(linear)
     if not np.isfinite(A).all():
         return float("inf")
@@ -53,12 +51,10 @@ def spectral_radius(model: mujoco.MjModel, timestep_s: float) -> float:
 
 
 def largest_stable_timestep(model: mujoco.MjModel) -> float:
-    """The largest stable physics step, at most a little above the model's own [s].
-
-    It is found to a thousandth.
+    """Find the largest stable physics step to a thousandth, at most 1.1 times the model's own [s].
 
     Raises:
-        ConfigurationError: None is, down to a millionth of it.
+        ConfigurationError: No step down to a millionth of the model's own is stable.
     """
     high = _ROOM * model.opt.timestep
     low = 0.0
@@ -79,12 +75,12 @@ def largest_stable_timestep(model: mujoco.MjModel) -> float:
 
 
 def is_stable(model: mujoco.MjModel) -> bool:
-    """True if the model's physics step is stable, with a tenth of room."""
+    """Return True if 1.1 times the model's physics step is stable."""
     return spectral_radius(model, _ROOM * model.opt.timestep) <= _LARGEST_RADIUS
 
 
-def with_room(timestep_s: float) -> float:
-    """The largest physics step of two digits that is a tenth below a limit of stability [s]."""
+def round_below(timestep_s: float) -> float:
+    """Return the largest step of two digits that is a tenth below a limit of stability [s]."""
     digit = 10.0 ** (np.floor(np.log10(timestep_s / _ROOM)) - 1.0)
     return float(np.floor(timestep_s / _ROOM / digit) * digit)
 
@@ -93,11 +89,11 @@ def require_stable(model: mujoco.MjModel, control_period_s: float) -> None:
     """Refuse a model whose joints explode with its physics step.
 
     Args:
-        model: With the physics step that it is to be played with.
-        control_period_s: Which the physics step has to divide [s].
+        model: Compiled model with its physics step.
+        control_period_s: Control period, which the physics step has to divide [s].
 
     Raises:
-        ConfigurationError: With the largest stable physics step.
+        ConfigurationError: The step is not stable; the message names the largest stable one.
     """
     stable = stable_timestep(model, control_period_s)
     if stable < model.opt.timestep:
@@ -109,10 +105,10 @@ def require_stable(model: mujoco.MjModel, control_period_s: float) -> None:
 
 
 def stable_timestep(model: mujoco.MjModel, control_period_s: float) -> float:
-    """The model's physics step, or the largest stable one that divides a period [s].
+    """Return the model's physics step, or the largest stable one that divides a period [s].
 
     Raises:
-        ConfigurationError: None is stable, down to a millionth of it.
+        ConfigurationError: No step down to a millionth of the model's own is stable.
     """
     if is_stable(model):
         return float(model.opt.timestep)
@@ -121,7 +117,7 @@ def stable_timestep(model: mujoco.MjModel, control_period_s: float) -> float:
 
 
 def _without_constraints(model: mujoco.MjModel) -> mujoco.MjModel:
-    """The model with nothing that holds a joint back."""
+    """Copy a model without the forces that hold a joint back."""
     linear = copy.copy(model)
     linear.opt.disableflags |= int(np.bitwise_or.reduce(_LEFT_OUT))
     linear.dof_frictionloss[:] = 0.0
@@ -132,7 +128,7 @@ def _without_constraints(model: mujoco.MjModel) -> mujoco.MjModel:
 
 
 def _transition(model: mujoco.MjModel) -> Array:
-    """A by central differences: MuJoCo's own do not take RK4."""
+    """Compute A by central differences: MuJoCo's own do not support RK4."""
     size = 2 * model.nv + model.na
     data = mujoco.MjData(model)
     A = np.empty((size, size))

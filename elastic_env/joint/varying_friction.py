@@ -1,16 +1,16 @@
 """Dry friction that changes with load and speed, in MuJoCo.
 
 MuJoCo's `frictionloss` of a joint is one number. Friction that grows with the load, or falls from
-rest to motion, has to be set anew before every physics step. `make_elastic` leaves the parameters
-in the model, as numbers named `<joint>_dry_friction`, and the environments of this project look
-after them. A program with a loop of its own does so in one line:
+rest to motion, has to be set before every physics step. `make_elastic` stores the parameters in the
+model, as numbers named `<joint>_dry_friction`. The environments of this project set the friction
+from them. A program with its own loop does so in one line:
 
     friction = VaryingFriction(model)
     while running:
         friction.update(model, data)
         mujoco.mj_step(model, data)
 
-Load and speed are those at the beginning of the step, so that friction lags by one physics step.
+Load and speed are those at the beginning of the step: friction lags by one physics step.
 """
 
 from collections.abc import Callable
@@ -29,20 +29,20 @@ _Fields = Callable[[str], Array]
 
 
 def varies(joint: ElasticJoint) -> bool:
-    """True if a joint's dry friction changes with its load or speed."""
+    """Return True if a joint's dry friction changes with its load or speed."""
     return joint.load_friction > 0.0 or joint.static_friction > 0.0
 
 
 def add_terms(spec: mujoco.MjSpec, hinge: mujoco.MjsJoint, joint: ElasticJoint) -> None:
-    """Leave the friction of a joint in the specification of an elastic model.
+    """Store the friction of a joint in the specification of an elastic model.
 
     Args:
-        spec: Of the model.
-        hinge: Of the link; its `frictionloss` is the part that does not change.
-        joint: The rest.
+        spec: Specification of the model, which is changed.
+        hinge: Hinge of the link; its `frictionloss` is the constant term.
+        joint: Joint with the other terms.
     """
-    of_load = (joint.load_friction, joint.static_friction, joint.stribeck_speed)
-    terms = [hinge.frictionloss, *of_load]
+    varying = (joint.load_friction, joint.static_friction, joint.stribeck_speed)
+    terms = [hinge.frictionloss, *varying]
     spec.add_numeric(name=friction_name(hinge.name), size=_TERMS, data=terms)
 
 
@@ -50,7 +50,7 @@ class VaryingFriction:
     """Friction of the joints of an elastic model whose friction varies.
 
     Args:
-        model: Compiled from what `make_elastic` made.
+        model: Model of `make_elastic`, compiled.
 
     Attributes:
         joints: Names of these joints; empty where no friction varies.
@@ -67,37 +67,37 @@ class VaryingFriction:
         numerics = [model.numeric(friction_name(name)).id for name in self.joints]
         first = model.numeric_adr[numerics]
         self.numbers = first.astype(np.int64) + np.arange(_TERMS)[:, None]
-        is_sprung = at.theta != at.q
-        self._sprung = np.flatnonzero(is_sprung)
-        self._rigid = np.flatnonzero(~is_sprung)
-        springs = [model.tendon(spring_name(self.joints[i])).id for i in self._sprung]
+        has_spring = at.theta != at.q
+        self._elastic = np.flatnonzero(has_spring)
+        self._rigid = np.flatnonzero(~has_spring)
+        springs = [model.tendon(spring_name(self.joints[i])).id for i in self._elastic]
         self._springs = np.array(springs, dtype=np.int64)
         self._at = at
 
     @classmethod
     def of(cls, model: mujoco.MjModel) -> Self | None:
-        """The same; None where no friction varies."""
+        """Return the varying friction of a model; None where no friction varies."""
         if model.nnumeric == 0:
             return None
-        found = cls(model)
-        return found if found.joints else None
+        friction = cls(model)
+        return friction if friction.joints else None
 
     def update(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
         """Set the friction for the coming physics step of one world.
 
         Args:
-            model: Whose `dof_frictionloss` is set.
+            model: Model whose `dof_frictionloss` is set.
             data: Its state.
         """
         limits = self.limits(lambda name: getattr(model, name)[None], _rows_of(data))
         model.dof_frictionloss[self.links] = limits[0]
 
     def limits(self, field: _Fields, state: _Fields) -> Array:
-        """Friction F of worlds in their states, (num_worlds, n) [N·m].
+        """Return the friction F of worlds in their states, (num_worlds, n) [N·m].
 
         Args:
-            field: Rows of a field of the models, one for each world or one for all.
-            state: Rows of a field of the states.
+            field: Returns the rows of a named field of the models, one for each world or for all.
+            state: Returns the rows of a named field of the states.
         """
         terms = field("numeric_data")[:, self.numbers]
         return dry_friction(
@@ -112,18 +112,18 @@ class VaryingFriction:
     def _load(self, field: _Fields, state: _Fields) -> Array:
         """τ_J, (num_worlds, n) [N·m].
 
-        A joint without a spring passes what its actuators leave when its rotor is accelerated, as
-        of the last physics step.
+        A joint without a spring passes the torque of its actuators, less that of its rotor's
+        acceleration in the last physics step.
         """
         at = self._at
         qpos = state("qpos")
         qvel = state("qvel")
         load = np.zeros((len(qpos), len(self.joints)))
-        if len(sprung := self._sprung):
+        if len(elastic := self._elastic):
             ends = field("tendon_lengthspring")[:, self._springs]
-            load[:, sprung] = joint_torque(
-                qpos[:, at.theta[sprung]] - qpos[:, at.q[sprung]],
-                qvel[:, at.theta_dot[sprung]] - qvel[:, at.q_dot[sprung]],
+            load[:, elastic] = joint_torque(
+                qpos[:, at.theta[elastic]] - qpos[:, at.q[elastic]],
+                qvel[:, at.theta_dot[elastic]] - qvel[:, at.q_dot[elastic]],
                 stiffness=field("tendon_stiffness")[:, self._springs],
                 damping=field("tendon_damping")[:, self._springs],
                 backlash=ends[..., 1] - ends[..., 0],

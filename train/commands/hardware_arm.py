@@ -39,8 +39,8 @@ from elastic_env.hardware.safety.supervised_bus import SupervisedBus
 from elastic_env.hardware.settings import PATIENT_LIMITS
 from elastic_env.joint.joint_settings import JointSettings
 from elastic_env.joint.model_file import compiled_model
+from elastic_env.joint.model_joints import held_positions
 from elastic_env.joint.small_servos import SMALL_SERVOS
-from elastic_env.joint.supported_models import held_positions
 from elastic_env.rigid.tree.end_effector import EndEffector, outermost_body
 from elastic_env.robots.robot.joints import STIFF_OVER_SERVO
 from train.runs.console import can_redraw, make_table, print_files

@@ -42,8 +42,10 @@ from baselines.identification.servo_file import is_servo_log
 from baselines.identification.servo_result import ServoIdentification
 from baselines.identification.static_arm import StaticArm
 from elastic_env.core.errors import ConfigurationError, quote, unknown_name
-from elastic_env.joint.model_file import compiled_model, from_mujoco
-from elastic_env.joint.supported_models import commanded_hinges, hinges_of
+from elastic_env.joint.commanded_joints import commanded_hinges
+from elastic_env.joint.compile_model import call_mujoco
+from elastic_env.joint.model_file import compiled_model
+from elastic_env.joint.model_joints import hinges_of
 from elastic_env.world.robot_model import joint_ranges
 from train.commands.held_out import judge_poses, number_or_dash, show_held_out
 from train.commands.identify_geometry import identify_geometry
@@ -274,7 +276,7 @@ def shaped_model(path: str) -> mujoco.MjModel:
         return mujoco.MjSpec.from_file(path).compile()
 
     try:
-        shaped = from_mujoco(read, "the shapes of the model", "read")
+        shaped = call_mujoco(read, "the shapes of the model", "read")
     except ConfigurationError:
         return plain
     return shaped if set(hinges_of(plain)) <= set(hinges_of(shaped)) else plain

@@ -18,7 +18,7 @@ from baselines.identification.holdout import Judged
 from baselines.identification.pose_log import PoseLog
 from elastic_env.core.errors import list_names, unknown_name
 from elastic_env.joint.model_file import read_model
-from elastic_env.joint.supported_models import held_positions
+from elastic_env.joint.model_joints import held_positions
 from elastic_env.rigid.tree.end_effector import site_or_body
 from elastic_env.rigid.tree.links import Tree
 from train.commands.held_out import judge_poses, number_or_dash, show_held_out

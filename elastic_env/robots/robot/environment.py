@@ -12,7 +12,9 @@ from typing import Any, Literal
 from mujoco import MjModel
 
 from elastic_env.core.errors import ConfigurationError, require_known
-from elastic_env.joint import supported_models as supported
+from elastic_env.joint import model_joints
+from elastic_env.joint.commanded_joints import without_fingers
+from elastic_env.joint.compile_model import compile_spec
 from elastic_env.joint.held_joints import hold_other_joints
 from elastic_env.joint.joint_settings import (
     HELD,
@@ -21,7 +23,8 @@ from elastic_env.joint.joint_settings import (
     joint_mapping,
     key_of,
 )
-from elastic_env.joint.model_file import GivenModel, compiled_spec
+from elastic_env.joint.model_file import GivenModel
+from elastic_env.joint.supported_models import require_robot
 from elastic_env.joint.time_step import stable_timestep
 from elastic_env.motion.arm_references import AnyArmReference
 from elastic_env.registration import Robot
@@ -118,7 +121,7 @@ def configure_robot(
     settings = robot.within_torque(settings, moves_home=home is None)
     if timestep_s is None:
         period_s = settings.control_period_s
-        model = compiled_spec(robot.elastic(settings), "the model with elastic joints")
+        model = compile_spec(robot.elastic(settings), "the model with elastic joints")
         timestep_s = stable_timestep(stiffest_plant(model, settings.scenario), period_s)
         if timestep_s < (shortest_s := period_s / MOST_SUBSTEPS):
             name, inertia = own_joints.lightest_links(robot.rigid().compile(), settings.joints)
@@ -138,12 +141,12 @@ def joint_robot(
 ) -> JointRobot:
     """A robot from its model and its elastic joints; arguments and errors as `configure_robot`."""
     spec = read_robot(model)
-    whole = compiled_spec(spec, "the model")
-    supported.require_robot(whole)
+    whole = compile_spec(spec, "the model")
+    require_robot(whole)
     settings = _elastic_hinges(whole, joints)
     names = list(settings)
     moving = hold_other_joints(spec, settings)
-    rigid = compiled_spec(moving.copy(), "the model with held joints")
+    rigid = compile_spec(moving.copy(), "the model with held joints")
     mass = float(rigid.body_subtreemass[0])
     elastic = own_joints.elastic_joints(moving, settings, LOAD_SHARE * mass)
     if len({joint.encoder_counts_per_turn for joint in elastic.values()}) > 1:
@@ -161,16 +164,16 @@ def joint_robot(
 
 def _elastic_hinges(model: MjModel, joints: GivenJoints) -> dict[str, JointSettings]:
     """Settings of the elastic hinges: of those that a pattern fits all but coupled fingers."""
-    hinges = supported.hinges_of(model)
+    hinges = model_joints.hinges_of(model)
     given = joint_mapping(joints)
     names = [model.joint(j).name for j in range(model.njnt)]
     others = [name for name in names if name not in hinges]
     settings = own_joints.elastic_settings(given, hinges, others)
     nameless = key_of(given, "")
     is_meant = nameless is not None and given[nameless] != HELD
-    if is_meant and supported.has_nameless_hinge(model):
-        raise supported.nameless_hinge()
-    moving = supported.without_fingers(model, settings, given)
+    if is_meant and model_joints.has_nameless_hinge(model):
+        raise model_joints.nameless_hinge()
+    moving = without_fingers(model, settings, given)
     return {name: settings[name] for name in moving}
 
 

@@ -18,8 +18,8 @@ from elastic_env.joint.joint_settings import (
     ServoSettings,
     read_joints,
 )
+from elastic_env.joint.model_joints import home_of, mass_matrix
 from elastic_env.joint.model_servo import force_limit, position_servo, rotor_inertia
-from elastic_env.joint.supported_models import home_of, mass_matrix
 from elastic_env.rigid.rigid_body import RigidBody
 from elastic_env.rigid.tree.end_effector import outermost_body
 from elastic_env.world.robot_model import joint_ranges

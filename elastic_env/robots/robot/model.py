@@ -8,8 +8,9 @@ import mujoco
 import numpy as np
 
 from elastic_env.core.errors import quote
+from elastic_env.joint.compile_model import compile_spec
 from elastic_env.joint.held_joints import hold_other_joints
-from elastic_env.joint.model_file import GivenModel, compiled_spec, read_model
+from elastic_env.joint.model_file import GivenModel, read_model
 from elastic_env.rendering.simple_bodies import add_simple_bodies
 
 
@@ -88,7 +89,7 @@ class RigidModel:
         given: Any = self._model
         if isinstance(given, mujoco.MjSpec):
             given = given.copy()
-            compiled_spec(given, "the specification")
+            compile_spec(given, "the specification")
             given = given.to_xml()
         return {"_model": given, "_joints": self._joints, "_spec": None}
 
