@@ -8,15 +8,12 @@ from mujoco import MjModel
 
 from elastic_env.core.errors import quote
 
-_WRAP_JOINT = int(mujoco.mjtWrap.mjWRAP_JOINT)
-_WRAP_SITE = int(mujoco.mjtWrap.mjWRAP_SITE)
-_WRAP_GEOMS = (int(mujoco.mjtWrap.mjWRAP_SPHERE), int(mujoco.mjtWrap.mjWRAP_CYLINDER))
-_EQ_JOINT = int(mujoco.mjtEq.mjEQ_JOINT)
-_EQ_TENDON = int(mujoco.mjtEq.mjEQ_TENDON)
-TENDON = int(mujoco.mjtTrn.mjTRN_TENDON)
-SITE = int(mujoco.mjtTrn.mjTRN_SITE)
-SLIDERCRANK = int(mujoco.mjtTrn.mjTRN_SLIDERCRANK)
-"""Transmissions of actuators that are not on a joint."""
+TRANSMISSIONS = {
+    int(mujoco.mjtTrn.mjTRN_TENDON): "a tendon",
+    int(mujoco.mjtTrn.mjTRN_SITE): "a site",
+    int(mujoco.mjtTrn.mjTRN_SLIDERCRANK): "a slider-crank",
+}
+"""Names of the transmissions of actuators that are not on a joint."""
 _NO_EQUALITIES = int(mujoco.mjtDisableBit.mjDSBL_EQUALITY | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
 _PULLING = "stiffness stiffnesspoly damping frictionloss armature"
 """Properties by which a tendon pulls."""
@@ -33,10 +30,10 @@ def equality_joints(model: MjModel, equality: int) -> tuple[set[int], str]:
     kind = int(model.eq_type[equality])
     both = (model.eq_obj1id[equality], model.eq_obj2id[equality])
     ends = [int(i) for i in both if i >= 0]
-    if kind == _EQ_JOINT:
+    if kind == mujoco.mjtEq.mjEQ_JOINT:
         joints = set(ends)
         element = model.joint
-    elif kind == _EQ_TENDON:
+    elif kind == mujoco.mjtEq.mjEQ_TENDON:
         joints = set().union(*(tendon_joints(model, t) for t in ends))
         element = model.tendon
     elif model.eq_objtype[equality] == mujoco.mjtObj.mjOBJ_SITE:
@@ -75,11 +72,11 @@ def tendon_joints(model: MjModel, tendon: int) -> set[int]:
     for at in range(first, first + int(model.tendon_num[tendon])):
         kind = int(model.wrap_type[at])
         element = int(model.wrap_objid[at])
-        if kind == _WRAP_JOINT:
+        if kind == mujoco.mjtWrap.mjWRAP_JOINT:
             joints.add(element)
-        elif kind == _WRAP_SITE:
+        elif kind == mujoco.mjtWrap.mjWRAP_SITE:
             bodies.append(int(model.site_bodyid[element]))
-        elif kind in _WRAP_GEOMS:
+        elif kind in (mujoco.mjtWrap.mjWRAP_SPHERE, mujoco.mjtWrap.mjWRAP_CYLINDER):
             bodies.append(int(model.geom_bodyid[element]))
     return joints | joints_between(model, bodies)
 
@@ -94,9 +91,9 @@ def remote_actuator_joints(model: MjModel, actuator: int) -> set[int]:
     """Return the joints that an actuator moves by a tendon, a site or a slider-crank."""
     kind = int(model.actuator_trntype[actuator])
     first, second = (int(i) for i in model.actuator_trnid[actuator])
-    if kind == TENDON:
+    if kind == mujoco.mjtTrn.mjTRN_TENDON:
         return tendon_joints(model, first)
-    if kind in (SITE, SLIDERCRANK):
+    if kind in TRANSMISSIONS:
         sites = [site for site in (first, second) if site >= 0]
         bodies = [int(model.site_bodyid[site]) for site in sites]
         return joints_between(model, [*bodies, 0][:2])

@@ -6,18 +6,8 @@ from collections.abc import Collection, Iterable
 import mujoco
 from mujoco import MjModel
 
-from elastic_env.joint.affected_joints import (
-    active_equalities,
-    equality_joints,
-    joints_to_world,
-)
-from elastic_env.joint.model_joints import (
-    first_names,
-    has_nameless_hinge,
-    hinge_ids,
-    hinges_of,
-    nameless_hinge,
-)
+from elastic_env.joint import model_joints
+from elastic_env.joint.affected_joints import active_equalities, equality_joints, joints_to_world
 from elastic_env.joint.supported_models import require_robot
 
 
@@ -35,9 +25,9 @@ def commanded_hinges(model: MjModel, named: Collection[str] = ()) -> list[str]:
         UserWarning: Fingers are held.
     """
     require_robot(model)
-    if has_nameless_hinge(model):
-        raise nameless_hinge()
-    return without_fingers(model, hinges_of(model), named)
+    if model_joints.has_nameless_hinge(model):
+        raise model_joints.nameless_hinge()
+    return without_fingers(model, model_joints.hinges_of(model), named)
 
 
 def without_fingers(model: MjModel, joints: Iterable[str], named: Collection[str]) -> list[str]:
@@ -49,9 +39,9 @@ def without_fingers(model: MjModel, joints: Iterable[str], named: Collection[str
     coupled = [name for name in coupled_fingers(model) if name not in named]
     fingers = [name for name in coupled if name in joints]
     if fingers:
+        names = model_joints.first_names(fingers)
         warnings.warn(
-            f"{first_names(fingers)} are coupled in the model (mimic), and are held, unlike all"
-            " others",
+            f"{names} are coupled in the model (mimic), and are held, unlike all others",
             stacklevel=5,
         )
     return [name for name in joints if name not in fingers]
@@ -76,7 +66,7 @@ def coupled_fingers(model: MjModel) -> list[str]:
             coupled |= affected
     hands = [group for group in groups if group & coupled and _is_gripper(model, group)]
     fingers = set().union(*hands)
-    names = [model.joint(j).name for j in hinge_ids(model) if j in fingers]
+    names = [model.joint(j).name for j in model_joints.hinge_ids(model) if j in fingers]
     return [name for name in names if name]
 
 

@@ -10,25 +10,8 @@ import numpy as np
 from mujoco import MjModel
 
 from elastic_env.core.errors import ConfigurationError, quote, require_known
-from elastic_env.joint.affected_joints import (
-    SITE,
-    SLIDERCRANK,
-    TENDON,
-    active_equalities,
-    equality_joints,
-    remote_actuator_joints,
-    tendon_joints,
-    tendon_pulls,
-)
+from elastic_env.joint import affected_joints, model_joints
 from elastic_env.joint.compile_model import require_sound
-from elastic_env.joint.model_joints import (
-    first_names,
-    hinge_ids,
-    hinges_of,
-    home_of,
-    mass_matrix,
-    nameless_hinge,
-)
 
 MOST_ELASTIC = 80
 """Largest number of elastic joints: the time of the stability check grows with their cube."""
@@ -72,12 +55,12 @@ def require_hinge(model: MjModel) -> None:
     Raises:
         ConfigurationError: It has no hinge, or none with a name.
     """
-    if not hinge_ids(model):
+    if not model_joints.hinge_ids(model):
         raise ConfigurationError(
             "the model has no hinge, and elastic joints are hinges; give a robot with rotary joints"
         )
-    if not hinges_of(model):
-        raise nameless_hinge()
+    if not model_joints.hinges_of(model):
+        raise model_joints.nameless_hinge()
 
 
 def require_few(joints: Collection[str]) -> None:
@@ -128,28 +111,29 @@ def require_known_torque(model: MjModel, joints: Sequence[str]) -> None:
     ids = _ids_of(model, joints)
     require_flags(int(model.opt.disableflags), _RESTING)
     _require_no_body_forces(model)
-    for e in active_equalities(model):
-        affected, ends = equality_joints(model, e)
+    for e in affected_joints.active_equalities(model):
+        affected, ends = affected_joints.equality_joints(model, e)
         if affected & ids:
             raise ConfigurationError(
                 f"the model has an equality constraint of {ends}, whose torque is not known in"
                 f" advance; take it out of the model{_hold_cure(model, affected & ids, ids)}"
             )
     for t in range(model.ntendon):
-        if tendon_pulls(model, t) and (affected := tendon_joints(model, t) & ids):
+        affected = affected_joints.tendon_joints(model, t) & ids
+        if affected and affected_joints.tendon_pulls(model, t):
             raise ConfigurationError(
                 f"the model's tendon {model.tendon(t).name!r} has stiffness, damping, friction or"
                 " inertia; the torque of tendons with stiffness is not compensated; take it out of"
                 f" the model{_hold_cure(model, affected, ids)}"
             )
     for a in range(model.nactuator):
-        if affected := remote_actuator_joints(model, a) & ids:
-            names = first_names([model.joint(j).name for j in sorted(affected)])
+        if affected := affected_joints.remote_actuator_joints(model, a) & ids:
+            names = model_joints.first_names([model.joint(j).name for j in sorted(affected)])
+            transmission = affected_joints.TRANSMISSIONS[int(model.actuator_trntype[a])]
             raise ConfigurationError(
                 f"the model's actuator {model.actuator(a).name!r} drives {names} by"
-                f" {_TRANSMISSIONS[int(model.actuator_trntype[a])]}, which is not compensated;"
-                " drive each joint by an actuator of its own, or take this one out of the"
-                f" model{_hold_cure(model, affected, ids)}"
+                f" {transmission}, which is not compensated; drive each joint by an actuator of its"
+                f" own, or take this one out of the model{_hold_cure(model, affected, ids)}"
             )
     for j in np.flatnonzero(model.jnt_stiffnesspoly.any(axis=-1)):
         if int(j) in ids:
@@ -158,9 +142,6 @@ def require_known_torque(model: MjModel, joints: Sequence[str]) -> None:
                 " is not compensated; give it one number"
             )
     _require_inertia(model, joints)
-
-
-_TRANSMISSIONS = {TENDON: "a tendon", SITE: "a site", SLIDERCRANK: "a slider-crank"}
 
 
 def _ids_of(model: MjModel, joints: Sequence[str]) -> set[int]:
@@ -217,9 +198,9 @@ def _require_inertia(model: MjModel, joints: Sequence[str]) -> None:
     dofs = model.jnt_dofadr[at]
     smallest = []
     for offset in _POSES:
-        data.qpos[:] = home_of(model)
+        data.qpos[:] = model_joints.home_of(model)
         data.qpos[model.jnt_qposadr[at]] += offset
-        full = mass_matrix(model, data)
+        full = model_joints.mass_matrix(model, data)
         links = full[np.ix_(dofs, dofs)] - np.diag(model.dof_armature[dofs])
         scale = np.sqrt(np.maximum(np.diag(links), np.finfo(np.float64).tiny))
         with np.errstate(over="ignore"):
