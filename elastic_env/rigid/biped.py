@@ -1,4 +1,4 @@
-"""A robot with two legs, as its gait knows it."""
+"""Model of a robot with two legs, for gaits."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -20,7 +20,7 @@ class Biped:
         rigid: Compiled rigid model with a free pelvis.
         joint_names: The twelve hinges, left leg first, from hip to foot.
         leg: Lengths of thigh and shank.
-        hips: Where the hip axes meet, left and right, in the pelvis frame, (2, 3) [m].
+        hips: Intersections of the hip axes, left and right, in the pelvis frame, (2, 3) [m].
         ankle_height: Height of the ankle axes over the sole [m].
         sole_half_size: Half length and half width of the soles, whose middles lie under the ankles
             [m].
@@ -40,7 +40,7 @@ class Biped:
 
     @cached_property
     def chains_above_feet(self) -> LegChains:
-        """The legs with feet that weigh nothing: what the sensors at the ankles do not carry."""
+        """The legs without weight of the feet: the sensors at the ankles do not measure it."""
         return LegChains(self.rigid, self._legs, weightless=self.feet)
 
     @cached_property
@@ -88,7 +88,7 @@ class Biped:
         Args:
             pelvis: Position of the pelvis, (..., 3) [m].
             ankles: Positions of the ankles, (..., 2, 3) [m].
-            heading: Of the pelvis, (...) [rad].
+            heading: Heading of the pelvis, (...) [rad].
             foot_yaw: Headings of the feet, (..., 2) [rad].
 
         Returns:
@@ -97,11 +97,11 @@ class Biped:
         Raises:
             ElasticError: A foot is out of reach.
         """
-        ahead = np.asarray(heading)[..., None]
-        apart = ahead - foot_yaw
-        target = turn(ankles - pelvis[..., None, :], -ahead) - self.hips
+        heading = np.asarray(heading)[..., None]
+        hip_yaw = heading - foot_yaw
+        target = turn(ankles - pelvis[..., None, :], -heading) - self.hips
         level = np.broadcast_to(np.eye(3), (*target.shape, 3))
-        # the hip's first axis is vertical: it turns the leg of a sole that does not turn
-        q = leg_angles(self.leg, turn(target, apart), level)
-        q[..., 0] -= apart
+        # the hip's first axis is vertical: solve for a parallel sole, then turn the whole leg
+        q = leg_angles(self.leg, turn(target, hip_yaw), level)
+        q[..., 0] -= hip_yaw
         return q.reshape(*pelvis.shape[:-1], 2 * len(JOINTS))

@@ -1,4 +1,4 @@
-r"""Share of the feet in the ground's force: Eqs. 5 and 6 of the paper, contact at the ZMP.
+r"""Shares of the feet in the ground's force: Eqs. 5 and 6 of the paper, contact at the ZMP.
 
 Each foot takes its share of the force, F_r = μ F and F_l = (1 − μ) F, at a point of its own, so
 that both together act at the ZMP:
@@ -33,12 +33,12 @@ def load_share(point: Array, feet: Array) -> Array:
 
 
 def shares(share_right: Array) -> Array:
-    """Shares of left and right foot, (...) to (..., 2)."""
+    """Return the shares of left and right foot, (...) to (..., 2)."""
     return np.stack([1.0 - share_right, share_right], axis=-1)
 
 
 def contact_points(zmp: Array, share_right: Array, feet: Array) -> Array:
-    """Points at which the forces of the feet act, (..., 2, 2) [m]; arguments as `load_share`."""
+    """Return the points at which the forces of the feet act, (..., 2, 2) [m]; see `load_share`."""
     weights = shares(share_right)
     rest = zmp - (weights[..., None] * feet).sum(axis=-2)
     return feet + rest[..., None, :]

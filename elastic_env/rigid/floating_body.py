@@ -1,8 +1,8 @@
 """Rigid-body dynamics of a robot on a free base by Pinocchio, one posture after the other.
 
-The only file that imports pinocchio. The tests compare with it what MuJoCo or we compute of a
-model. Kinematic tree and inertias are taken from a compiled MuJoCo model in full precision (its XML
-output has six digits); the algorithms are Pinocchio's.
+This is the only file that imports Pinocchio. Tests compare it with MuJoCo and with our formulas.
+Kinematic tree and inertias come from a compiled MuJoCo model in full precision (its XML output has
+six digits).
 """
 
 from collections.abc import Sequence
@@ -28,11 +28,12 @@ class FloatingBody:
     """
 
     def __init__(self, model: mujoco.MjModel, joints: Sequence[str]) -> None:
-        are_free = np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)
-        free = [model.joint(int(j)).name for j in are_free]
+        free_ids = np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)
+        free = [model.joint(int(j)).name for j in free_ids]
         if len(free) != 1:
-            found = f"this model has {len(free)}"
-            raise ConfigurationError(f"a floating robot needs one free joint, {found}")
+            raise ConfigurationError(
+                f"a floating robot needs one free joint, this model has {len(free)}"
+            )
         require_hinge_tree(model, joints, but=free)
         self._model = pinocchio_model(model)
         self._data = self._model.createData()
@@ -72,7 +73,7 @@ class FloatingBody:
             rate[base : base + 3] = velocity[:3]
             rate[base + 5] = velocity[3]
             rate[self._v] = q_dot[i]
-            # the change of the velocity in a frame that turns
+            # acceleration in the turning frame of the base
             change[base : base + 3] = base_ddot[i, :3]
             change[base] += velocity[3] * velocity[1]
             change[base + 1] -= velocity[3] * velocity[0]
@@ -85,7 +86,7 @@ class FloatingBody:
         return wrench, torque
 
     def _position(self, q: Array) -> Array:
-        """Pinocchio's position of hinges (n,) [rad] on a level base."""
+        """Return Pinocchio's position vector for hinges (n,) [rad] on a level base."""
         position = np.zeros(self._model.nq)
         position[self._base_q + 6] = 1.0  # the unit quaternion of a level base
         position[self._q] = q - self._zero
@@ -108,7 +109,7 @@ class FloatingBody:
 
 
 def pinocchio_model(model: mujoco.MjModel) -> pinocchio.Model:
-    """Pinocchio's model of a MuJoCo tree of hinges, with or without a free base."""
+    """Return Pinocchio's model of a MuJoCo tree of hinges, with or without a free base."""
     tree = pinocchio.Model()
     tree.gravity.linear = model.opt.gravity.copy()
     joint_of = {0: 0}  # MuJoCo body -> Pinocchio joint that carries it

@@ -1,7 +1,7 @@
 """Statics of legs that hang from one pelvis, for many robots at once.
 
 The legs are a tree of `elastic_env.rigid.tree.kernels` whose base is the pelvis and whose tips are
-the feet. The pelvis' orientation is given by the direction of gravity.
+the feet. The direction of gravity gives the orientation of the pelvis.
 """
 
 import copy
@@ -17,22 +17,22 @@ from elastic_env.rigid.tree import kernels
 from elastic_env.rigid.tree.links import Tree
 
 _ANKLE: Array = np.zeros(3)
-_OF_PELVIS: Array = np.empty((0, 2))
-"""No attitudes: the level frame is that of the pelvis."""
+_NO_ATTITUDE: Array = np.empty((0, 2))
+"""No attitudes: results are in the frame of the pelvis."""
 _NO_TORQUE: Array = np.empty((0, 0))
 
 
 class LegChains:
-    """The L legs of one robot, equally long chains of hinges that hang from one pelvis, n in all.
+    """The L legs of one robot, chains of equally many hinges at one pelvis, n hinges in all.
 
     Args:
         model: Compiled rigid model.
         legs: Joint names of every leg, from hip to foot.
-        weightless: Bodies without weight, such as feet that a sensor above them weighs already.
+        weightless: Bodies to count without weight, such as feet below a force sensor.
 
     Attributes:
         mass: Mass of the whole robot, without the weightless bodies [kg].
-        loads_type: Type of the rows that say what loads a robot, to be filled.
+        loads_type: Type of the rows of loads on a robot.
         links: The tree, rows of `elastic_env.rigid.tree.kernels.LINK`.
     """
 
@@ -42,18 +42,18 @@ class LegChains:
         legs: Sequence[Sequence[str]],
         weightless: Sequence[int] = (),
     ) -> None:
-        weighed = copy.copy(model)
-        weighed.body_mass[list(weightless)] = 0.0
+        model_copy = copy.copy(model)
+        model_copy.body_mass[list(weightless)] = 0.0
         pelvis = int(model.body_parentid[model.joint(legs[0][0]).bodyid[0]])
         joints = [name for leg in legs for name in leg]
-        tree = Tree.of(weighed, joints, {}, root=pelvis)
+        tree = Tree.of(model_copy, joints, {}, root=pelvis)
         for number, leg in enumerate(legs):
             foot = int(model.joint(leg[-1]).bodyid[0])
             link = tree.links[tree.carrier[foot]]
             link["tip"] = number
             link["tip_R"] = tree.R[foot]
             link["tip_place"] = tree.place[foot]
-        self.mass = float(weighed.body_mass.sum())
+        self.mass = float(model_copy.body_mass.sum())
         self.loads_type = kernels.loads_type(len(legs))
         self.links = tree.links
         self._legs = len(legs)
@@ -63,31 +63,31 @@ class LegChains:
         return self.com_and_feet(q)[0]
 
     def com_and_feet(
-        self, q: Array, point: Array = _ANKLE, attitude: Array = _OF_PELVIS
+        self, q: Array, point: Array = _ANKLE, attitude: Array = _NO_ATTITUDE
     ) -> tuple[Array, Array]:
-        """Center of mass of the robot, and a point that is fixed in each foot, from the pelvis.
+        """Return the center of mass of the robot and a point fixed in each foot, from the pelvis.
 
         Args:
             q: (rows, n) [rad].
-            point: From the ankle, in the frame of the foot, (3,) [m].
-            attitude: Roll and pitch of the pelvis, for a level frame, (rows, 2) [rad]; none for the
-                pelvis frame, (0, 2).
+            point: Point from the ankle, in the frame of the foot, (3,) [m].
+            attitude: Roll and pitch of the pelvis, for a level frame, (rows, 2) [rad]; no rows,
+                (0, 2), for the pelvis frame.
 
         Returns:
             (rows, 3) and (rows, L, 3) [m].
         """
         com = np.empty((len(q), 3))
         feet = np.empty((len(q), self._legs, 3))
-        kernels.local_frames(self.links, _dense(q), _dense(attitude), point, com, feet)
+        kernels.com_and_tips(self.links, _dense(q), _dense(attitude), point, com, feet)
         return com, feet
 
     def sole_tilts(self, q: Array, attitude: Array, bending: Array) -> Array:
-        """Tilt of the soles by motors and IMU, and the share of it that the joints' bending makes.
+        """Return the tilt of the soles by motors and IMU, and its share by the joints' deflection.
 
         Args:
             q: (rows, n) [rad].
             attitude: Roll and pitch of the pelvis, (rows, 2) [rad].
-            bending: Of the joints, (rows, n) [rad].
+            bending: Deflection of the joints, (rows, n) [rad].
 
         Returns:
             Both, (2, rows, L, 2) [rad].
@@ -105,15 +105,15 @@ class LegChains:
         point: Array | float = 0.0,
         wrench: tuple[Array, Array] | None = None,
     ) -> Any:
-        """Rows of what loads each robot.
+        """Return rows of loads, one for each robot.
 
         A mass is negative where the ground carries the foot. A wrench turns with its foot.
 
         Args:
-            rows: How many.
+            rows: Number of rows.
             gravity: Acceleration of gravity in the pelvis frame, (rows, 3) [m/s²].
-            mass: At a point of each foot, (rows, L) [kg].
-            point: From the ankle, in the frame of the foot, (rows, L, 3) [m].
+            mass: Mass at a point of each foot, (rows, L) [kg].
+            point: Point from the ankle, in the frame of the foot, (rows, L, 3) [m].
             wrench: Force on each foot and moment about its ankle, in the frame of the foot, (rows,
                 L, 3) each [N], [N·m]; None for none.
         """
@@ -133,7 +133,7 @@ class LegChains:
 
 
 class LegTorque(NamedTuple):
-    """Torques of legs under loads that go with any posture, (num_worlds, n)."""
+    """Torques of legs under loads that stay the same in any posture, (num_worlds, n)."""
 
     chains: LegChains
     loads: Any
@@ -167,16 +167,16 @@ class LegTorque(NamedTuple):
             ElasticError: The matrix is singular.
         """
         x = np.empty(q.shape)
-        own = _NO_TORQUE if torque is None else _dense(torque)
+        right = _NO_TORQUE if torque is None else _dense(torque)
         links = self.chains.links
-        if not kernels.solutions(links, self.loads, _dense(q), stiffness, own, x):
+        if not kernels.solve_legs(links, self.loads, _dense(q), stiffness, right, x):
             torque = self.gravity_torque(q) if torque is None else torque
-            # says so if it is singular
+            # raises the error of a singular matrix
             K = np.broadcast_to(stiffness, q.shape)
             solve_stiffness(K, self.gravity_gradient(q), torque)
         return x
 
 
 def _dense(values: Array) -> Array:
-    """An array in one piece, so that one kernel fits all."""
+    """Return a contiguous array, so that one kernel fits all arrays."""
     return np.ascontiguousarray(values)

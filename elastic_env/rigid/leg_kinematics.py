@@ -6,7 +6,7 @@ the pelvis is
 
 .. math:: R = R_z(q_1) R_x(q_2) R_y(q_3) R_y(q_4) R_y(q_5) R_x(q_6)
 
-and a positive knee angle bends the shank backwards. All functions work on (..., ) batches of poses.
+and a positive knee angle bends the shank backwards. All functions work on batches of poses, (...).
 """
 
 from dataclasses import dataclass
@@ -73,10 +73,10 @@ def leg_angles(leg: LegGeometry, position: Array, R: Array) -> Array:
     B = leg.shank
     knee = np.arccos(np.clip((distance**2 - A**2 - B**2) / (2.0 * A * B), -1.0, 1.0))
     ankle_roll = np.arctan2(hip[..., 1], hip[..., 2])
-    in_plane = np.hypot(hip[..., 1], hip[..., 2])
-    of_knee = np.arctan2(-A * np.sin(knee), B + A * np.cos(knee))
-    ankle_pitch = of_knee - np.arctan2(hip[..., 0], in_plane)
-    # Rz Rx Ry of the hip
+    height = np.hypot(hip[..., 1], hip[..., 2])
+    knee_part = np.arctan2(-A * np.sin(knee), B + A * np.cos(knee))
+    ankle_pitch = knee_part - np.arctan2(hip[..., 0], height)
+    # orientation of the thigh, Rz Rx Ry
     M = R @ rotation_x(-ankle_roll) @ rotation_y(-ankle_pitch - knee)
     yaw = np.arctan2(-M[..., 0, 1], M[..., 1, 1])
     roll = np.arctan2(M[..., 2, 1], np.hypot(M[..., 2, 0], M[..., 2, 2]))
@@ -100,7 +100,7 @@ def rotation_z(angle: Array) -> Array:
 
 
 def turn(vectors: Array, angle: Array) -> Array:
-    """Vectors turned about z: (..., 2) or (..., 3) by (...) [rad], both broadcast."""
+    """Turn vectors about z, (..., 2) or (..., 3), by angles (...) [rad]; both are broadcast."""
     cosine = np.cos(angle)
     sine = np.sin(angle)
     x = vectors[..., 0]
@@ -121,7 +121,7 @@ def rotation_of_tilt(attitude: Array) -> Array:
 
 
 def _rotation(angle: Array, first: int, second: int) -> Array:
-    """Rotation that turns axis `first` towards axis `second`."""
+    """Return the rotation that turns axis `first` towards axis `second`."""
     angle = np.asarray(angle, dtype=np.float64)
     R = np.zeros((*angle.shape, 3, 3))
     third = 3 - first - second

@@ -1,4 +1,4 @@
-"""Rigid-body dynamics of robots on a fixed base, batches in one pass."""
+"""Rigid-body dynamics of robots on a fixed base, for batches."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -18,8 +18,8 @@ class RigidBody:
 
     .. math:: \tau = M \ddot q + c(q, \dot q) + \tau_g(q) - \tau_{gravcomp}(q) + k_s (q - q_s)
 
-    k_s and q_s are stiffness and reference of the springs that the model's joints have. Damping and
-    friction of the model are not in it.
+    k_s and q_s are stiffness and reference of the springs of the model's joints. Damping and
+    friction of the model are not included.
 
     Attributes:
         tree: Links without a load.
@@ -56,10 +56,10 @@ class RigidBody:
         rows = self._rows(q)
         torque = np.empty(rows.shape)
         kernels.gravity_torques(self._links, self._loads, rows, torque)
-        return self._with_springs(torque, q)
+        return self._add_springs(torque, q)
 
     def gravity_gradient(self, q: Array) -> Array:
-        """Its gradient, (..., n) [rad] to (..., n, n) [N·m/rad]."""
+        """Gradient of `gravity_torque`, (..., n) [rad] to (..., n, n) [N·m/rad]."""
         rows = self._rows(q)
         gradient = np.empty((*rows.shape, self._n))
         kernels.gravity_gradients(self._links, self._loads, rows, gradient)
@@ -75,28 +75,28 @@ class RigidBody:
         motion = (self._rows(q), self._rows(q_dot), self._rows(q_ddot))
         torque = np.empty(motion[0].shape)
         kernels.inverse_dynamics(self._links, self._loads, motion, torque)
-        return self._with_springs(torque, q)
+        return self._add_springs(torque, q)
 
     def set_load(self, body: int, mass: float, place: Array) -> None:
-        """Let a body carry one point mass, in the place of the last one.
+        """Let a body carry one point mass, instead of the last one.
 
         Args:
             body: Number of the body in MuJoCo's model.
-            mass: Of the load, 0 for none [kg].
-            place: In the frame of the body, (3,) [m].
+            mass: Mass of the load, 0 for none [kg].
+            place: Its place in the frame of the body, (3,) [m].
         """
         self._links = self.tree.add_load(body, mass, place)
 
-    def _with_springs(self, torque: Array, q: Array) -> Array:
+    def _add_springs(self, torque: Array, q: Array) -> Array:
         torque = torque.reshape(q.shape)
         if self._has_springs:
             torque = torque + self.spring * (q - self.spring_rest)
         return torque
 
     def _rows(self, values: Array) -> Array:
-        """(..., n) as (rows, n) in one piece, so that one kernel fits all."""
+        """Convert (..., n) to contiguous (rows, n), so that one kernel fits all arrays."""
         if values.shape[-1:] != (self._n,):
-            # compiled code reads where nothing is, without a word
+            # compiled code does not check bounds
             needed = f"(..., {self._n}), got an array of shape {values.shape}"
             raise ElasticError(f"one value per joint is needed, {needed}")
         return np.ascontiguousarray(values, dtype=np.float64).reshape(-1, self._n)
@@ -108,21 +108,21 @@ class RigidBody:
 
 
 def needs_more_than_gravity(model: mujoco.MjModel) -> bool:
-    """True where springs of joints or `gravcomp` act on the links of a model."""
+    """Return True if springs of joints or `gravcomp` act on the links of a model."""
     return bool(model.jnt_stiffness.any() or model.body_gravcomp.any())
 
 
 def require_hinge_tree(
     model: mujoco.MjModel, joints: Sequence[str], but: Sequence[str | int] = ()
 ) -> None:
-    """Check that a rigid model moves by the named hinges alone, `but` some joints.
+    """Refuse a model with other moving joints than the named hinges, `but` some joints.
 
     Raises:
         ConfigurationError: A joint is no hinge, does not exist, or is left out.
     """
-    joints_of = [(j, model.joint(j).name) for j in range(model.njnt)]
-    others = [(j, name) for j, name in joints_of if j not in but and name not in but]
-    kinds = {name: model.jnt_type[j] for j, name in others}
+    names_of = [(j, model.joint(j).name) for j in range(model.njnt)]
+    moving = [(j, name) for j, name in names_of if j not in but and name not in but]
+    kinds = {name: model.jnt_type[j] for j, name in moving}
     names = list(kinds)
     for name, kind in kinds.items():
         if kind != mujoco.mjtJoint.mjJNT_HINGE:

@@ -21,7 +21,7 @@ class EndEffector:
     Args:
         model: Compiled rigid model on a fixed base.
         joints: Hinges that move, in the order of the last axis.
-        name: Site, or else body.
+        name: Name of a site, or else of a body.
         held: Position of every other joint, a hinge [rad] or a slide [m].
 
     Raises:
@@ -46,12 +46,12 @@ class EndEffector:
 
     def pose(self, q: Array) -> tuple[Array, Array]:
         """Position (..., 3) [m] and orientation (..., 3, 3) in the world, from (..., n) [rad]."""
-        position, R, *_ = self._walked(q)
+        position, R, *_ = self._chain_poses(q)
         return position.reshape(*q.shape[:-1], 3), R.reshape(*q.shape[:-1], 3, 3)
 
     def jacobian(self, q: Array) -> tuple[Array, Array]:
         """Derivative of position and turn in the world's axes, (..., 3, n) each [m/rad], [1]."""
-        position, _, axes, anchors = self._walked(q)
+        position, _, axes, anchors = self._chain_poses(q)
         moved, turned = np.zeros((2, len(position), 3, self._n))
         columns = self._chain["column"][:-1]
         levers = position[:, None] - anchors
@@ -61,43 +61,43 @@ class EndEffector:
         return moved.reshape(shape), turned.reshape(shape)
 
     def errors(self, q_ref: Array, q: Array) -> tuple[Array, Array]:
-        """Distance (...) [m] and angle (...) [rad] between what is wanted and what is."""
-        wanted, R_wanted = self.pose(q_ref)
-        found, R_found = self.pose(q)
-        # of small angles the sine of the half angle is exact, the cosine is not
-        half = np.linalg.norm(R_found - R_wanted, axis=(-2, -1)) / math.sqrt(8.0)
+        """Distance (...) [m] and angle (...) [rad] between the poses of reference and joints."""
+        position_ref, R_ref = self.pose(q_ref)
+        position, R = self.pose(q)
+        # for small angles the sine of the half angle is exact, the cosine is not
+        half = np.linalg.norm(R - R_ref, axis=(-2, -1)) / math.sqrt(8.0)
         angle = 2.0 * np.arcsin(np.minimum(half, 1.0))
-        return np.linalg.norm(found - wanted, axis=-1), angle
+        return np.linalg.norm(position - position_ref, axis=-1), angle
 
     def parts(self, q_ref: Array, q: Array) -> Array:
-        r"""Error of the position that the deviation of each joint makes alone, to first order.
+        r"""Error of the position by the deviation of each joint alone, to first order.
 
         .. math:: p(q) - p(q_{ref}) \approx \sum_j J_j(q_{ref}) (q_j - q_{ref,j})
 
         Args:
-            q_ref: Angles that are wanted, (..., n) [rad].
-            q: Angles that are, (..., n) [rad].
+            q_ref: Reference angles, (..., n) [rad].
+            q: Actual angles, (..., n) [rad].
 
         Returns:
             A term of the sum per joint, in the world's axes, (..., 3, n) [m].
         """
         return self.jacobian(q_ref)[0] * (q - q_ref)[..., None, :]
 
-    def _walked(self, q: Array) -> tuple[Array, ...]:
+    def _chain_poses(self, q: Array) -> tuple[Array, ...]:
         """Pose of the end effector; axis and anchor of each hinge before it, a row per posture."""
         rows = np.ascontiguousarray(q, dtype=np.float64).reshape(-1, self._n)
         count = len(rows)
         hinges = len(self._chain) - 1
         shapes = ((3,), (3, 3), (hinges, 3), (hinges, 3))
-        made = [np.empty((count, *shape)) for shape in shapes]
-        kernels.poses(self._chain, rows, *made)
-        return tuple(made)
+        outputs = tuple(np.empty((count, *shape)) for shape in shapes)
+        kernels.chain_poses(self._chain, rows, *outputs)
+        return outputs
 
 
 def outermost_body(model: MjModel) -> str:
-    """The named body with the most bodies between it and the base; the last of several.
+    """Return the named body that is farthest from the base in the tree; the last of several.
 
-    A body that no joint moves is none.
+    Bodies that no joint moves do not count.
 
     Raises:
         ConfigurationError: No body that a joint moves has a name.
@@ -115,19 +115,19 @@ def outermost_body(model: MjModel) -> str:
 
 
 def site_or_body(model: MjModel, name: str, kind: str = "site or body") -> tuple[int, Array, Array]:
-    """Body of a site or body; place (3,) [m] and orientation (3, 3) of its frame in that body.
+    """Return the body of a site or body, and place (3,) [m] and orientation (3, 3) in that body.
 
     Args:
         model: Compiled model.
-        name: Of the site, or else of the body.
-        kind: What the name should have named, for the error.
+        name: Name of the site, or else of the body.
+        kind: Kind of thing that the name should refer to, for the error.
 
     Raises:
         ConfigurationError: There is none of that name.
     """
     sites = [model.site(i).name for i in range(model.nsite)]
     bodies = [model.body(i).name for i in range(1, model.nbody)]
-    require_known(kind, [name], [one for one in (*sites, *bodies) if one])
+    require_known(kind, [name], list(filter(None, (*sites, *bodies))))
     if name not in sites:
         return int(model.body(name).id), np.zeros(3), np.eye(3)
     site = model.site(name)
@@ -135,7 +135,7 @@ def site_or_body(model: MjModel, name: str, kind: str = "site or body") -> tuple
 
 
 def _chain(tree: Tree, body: int) -> Any:
-    """Links from the base to what carries a body, and one more for what is fixed to it."""
+    """Return the links from the base to the link of a body, and one more for its end effector."""
     path = []
     link = tree.carrier[body]
     while link > 0:
