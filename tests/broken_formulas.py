@@ -56,6 +56,7 @@ _CONTROLLER = "baselines/walking/controller.py"
 _SHARE = "shifted = share - 4.0 * share * (1.0 - share) * shift / spacing"
 _PREVIEW = "elastic_env/motion/preview_control.py"
 _PLAN = "elastic_env/motion/walk_plan.py"
+_TRAJECTORY = "elastic_env/motion/trajectory.py"
 _STATISTICS = "train/evaluate/statistics.py"
 
 BROKEN = (
@@ -180,7 +181,9 @@ BROKEN = (
     BrokenFormula(_PREVIEW, "-config.com_height_m / config.gravity", "config.com_height_m", PLAN),
     BrokenFormula(_PREVIEW, "np.array([T**3 / 6.0", "np.array([T**3 / 3.0", PLAN),
     BrokenFormula(_PLAN, "np.sqrt(self.gravity / self.com_height)", "np.sqrt(self.gravity)", PLAN),
-    BrokenFormula(_PLAN, "samples[2:] - 2.0 * samples[1:-1]", "samples[2:] - samples[1:-1]", PLAN),
+    BrokenFormula(
+        _TRAJECTORY, "samples[2:] - 2.0 * samples[1:-1]", "samples[2:] - samples[1:-1]", PLAN
+    ),
     BrokenFormula(_STATISTICS, "np.mean(mine, axis=-1)", "np.median(mine, axis=-1)", STATISTICS),
     BrokenFormula(_STATISTICS, "0.5 * (mine == base)", "(mine == base)", STATISTICS),
     BrokenFormula(

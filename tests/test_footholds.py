@@ -22,7 +22,8 @@ from elastic_env.core.signals import Array
 from elastic_env.joint.joint_names import JointAddresses
 from elastic_env.motion.foot_clearance import sole_gap
 from elastic_env.motion.gait import LEFT, RIGHT, Footholds, footholds, make_gait
-from elastic_env.motion.walk_plan import derivatives, plan_walk
+from elastic_env.motion.trajectory import derivatives
+from elastic_env.motion.walk_plan import plan_walk
 from elastic_env.rendering.picture import CAMERA
 from elastic_env.rigid.leg_kinematics import foot_pose, rotation_z, turn
 from elastic_env.robots.thormang.config import WalkConfig

@@ -18,9 +18,9 @@ from elastic_env.joint.dynamixel import SERVO
 from elastic_env.joint.joint_names import JointAddresses
 from elastic_env.motion.gait import make_gait
 from elastic_env.motion.preview_control import PreviewConfig, follow_zmp
+from elastic_env.motion.trajectory import derivatives
 from elastic_env.motion.walk_plan import (
     WalkPlan,
-    derivatives,
     plan_walk,
     refine_plan,
     require_feasible,

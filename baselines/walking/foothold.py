@@ -68,7 +68,8 @@ from baselines.walking.zmp_shift import Stances, move_feet
 from elastic_env.core.compiled import compiled, compiled_part, record_type
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array, IntArray, Mirrored, SignalGroup
-from elastic_env.motion.walk_plan import derivatives, refine_plan
+from elastic_env.motion.trajectory import derivatives
+from elastic_env.motion.walk_plan import refine_plan
 from elastic_env.rigid.leg_kinematics import turn
 from elastic_env.world.foot_sensors import FootSensors
 from elastic_env.world.robot_model import WalkerModel

@@ -88,8 +88,7 @@ from baselines.walking.zmp_shift import within_reach
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array, IntArray
 from elastic_env.motion.gait import RIGHT
-from elastic_env.motion.trajectory import STAND_S, minimum_jerk
-from elastic_env.motion.walk_plan import derivatives
+from elastic_env.motion.trajectory import STAND_S, derivatives, minimum_jerk
 from elastic_env.rigid.contact_force import shares
 from elastic_env.rigid.leg_kinematics import foot_pose, leg_angles, rotation_of_tilt, turn
 from elastic_env.world.robot_model import WalkerModel

@@ -1,7 +1,7 @@
 """References of robots of several joints: poses, moves, a line, a circle, a user's file.
 
-Those of `elastic_env.motion.references` move every joint alike. These know the robot: its joint
-ranges, its home, and where its end effector is. All begin with a second of standing.
+Those of `elastic_env.motion.references` move every joint alike. These depend on the robot: on its
+joint ranges, its home, and its end effector. All begin with a second of standing.
 """
 
 from dataclasses import dataclass
@@ -30,17 +30,17 @@ from elastic_env.motion.trajectory import (
 from elastic_env.rigid.tree.end_effector import EndEffector
 
 _TRIES = 1000
-_SHORTEST_S = 1e-6
+_LEAST_PERIOD_S = 1e-6
 _LARGEST_RAD = 1e4
 _MOST_ROWS = 2_000_000
 _HALF_TURN = np.pi / 2
 _MARGIN = 0.1
 """Share of a joint's range that drawn poses keep from either end."""
-_ROUNDS = 200
-_NEARBY = 64
-_STRIDE = 0.05
-"""Of a search for a pose that servos hold: rounds, poses drawn in each, and how far apart, as a
-share of the range.
+_SEARCH_ROUNDS = 200
+_SEARCH_POSES = 64
+_SEARCH_STRIDE = 0.05
+"""Search for a pose that servos hold: rounds, poses drawn in each, and their distance as a share of
+the range.
 """
 
 
@@ -50,15 +50,15 @@ class WeakServosError(ConfigurationError):
 
 @dataclass(frozen=True)
 class Workspace:
-    """A robot as its references know it.
+    """Properties of a robot that its references depend on.
 
     Attributes:
         joints: Names of the joints, in order.
         lowest, highest: Ranges of the joints, infinite where there is none, (n,) [rad].
         home: Angles about which the robot moves, (n,) [rad].
-        lack: Torque that the servos lack to hold poses at rest, over what they have, summed over
-            the joints; from (..., n) [rad] to (...) [1].
-        end_effector: Where the tool is; None for a robot without one.
+        lack: Torque that the servos lack to hold poses at rest, relative to their limits, summed
+            over the joints; from (..., n) [rad] to (...) [1].
+        end_effector: Tool; None for a robot without one.
     """
 
     joints: tuple[str, ...]
@@ -68,10 +68,10 @@ class Workspace:
     lack: Any
     end_effector: EndEffector | None
 
-    def around_home(self, within_rad: float = _HALF_TURN) -> tuple[Array, Array]:
-        """Lowest and highest angles of drawn poses, (n,) each [rad].
+    def pose_bounds(self, within_rad: float = _HALF_TURN) -> tuple[Array, Array]:
+        """Return lowest and highest angles of drawn poses, (n,) each [rad].
 
-        They keep a tenth of the range from its ends, and lie within an angle of home.
+        They are a tenth of the range away from its ends, and within an angle of home.
         """
         extent = self.highest - self.lowest
         width = np.where(np.isfinite(extent), _MARGIN * extent, _MARGIN)
@@ -80,39 +80,39 @@ class Workspace:
         return low, high
 
     def poses(self, generator: np.random.Generator, count: int, within_rad: float) -> Array:
-        """Poses that the servos hold, evenly over the joint angles, (count, n) [rad].
+        """Draw poses that the servos hold, evenly over the joint angles, (count, n) [rad].
 
         Raises:
             WeakServosError: The servos are too weak for almost all poses.
         """
-        low, high = self.around_home(within_rad)
+        low, high = self.pose_bounds(within_rad)
         n = len(self.home)
-        found = np.empty((0, n))
+        poses = np.empty((0, n))
         for _ in range(_TRIES):
             drawn = generator.uniform(low, np.maximum(high, low), (count, n))
-            found = np.concatenate([found, drawn[self.lack(drawn) == 0.0]])[:count]
-            if len(found) == count:
-                return found
+            poses = np.concatenate([poses, drawn[self.lack(drawn) == 0.0]])[:count]
+            if len(poses) == count:
+                return poses
         raise WeakServosError(
             "the servos hold hardly any pose of the workspace; give them a larger torque_limit"
         )
 
     def held_home(self) -> Array | None:
-        """Home, or else a pose near it that the servos hold, (n,) [rad]; None if none is found."""
+        """Find a pose at home or near it that the servos hold, (n,) [rad]; None if none is found."""
         generator = np.random.default_rng(0)
-        low, high = self.around_home()
-        stride = _STRIDE * np.maximum(high - low, 0.0)
+        low, high = self.pose_bounds()
+        stride = _SEARCH_STRIDE * np.maximum(high - low, 0.0)
         pose = self.home
-        for _ in range(_ROUNDS):
+        for _ in range(_SEARCH_ROUNDS):
             if self.lack(pose) == 0.0:
-                return self._closer(pose)
-            drawn = pose + stride * generator.standard_normal((_NEARBY, len(pose)))
+                return self._move_home(pose)
+            drawn = pose + stride * generator.standard_normal((_SEARCH_POSES, len(pose)))
             nearby = np.vstack([pose, np.clip(drawn, low, high)])
             pose = nearby[self.lack(nearby).argmin()]
         return None
 
-    def _closer(self, pose: Array) -> Array:
-        """A pose that servos hold, with every joint at home that need not leave it, (n,) [rad]."""
+    def _move_home(self, pose: Array) -> Array:
+        """Move every joint of a pose home for which the servos still hold it, (n,) [rad]."""
         for joint, angle in enumerate(self.home):
             returned = pose.copy()
             returned[joint] = angle
@@ -121,7 +121,7 @@ class Workspace:
         return pose
 
 
-class _Drawn(RepeatableReference):
+class _RandomPoses(RepeatableReference):
     """References with drawn poses."""
 
     positions: int = quantity("1", 8, ge=1, le=1000)
@@ -133,9 +133,9 @@ class _Drawn(RepeatableReference):
     seed: int | None = quantity("1", 0, ge=0, le=LARGEST_SEED)
     """Seed of the poses; None draws new ones per episode [1]."""
 
-    def _moved(self, visits: Array, t: Array, period_s: float) -> tuple[Array, Array, Array]:
-        """Motion between poses, (T, n) each: one move at the beginning of each period."""
-        number = _numbers(t, period_s, self.positions)
+    def _motion(self, visits: Array, t: Array, period_s: float) -> tuple[Array, Array, Array]:
+        """Return motion between poses, (T, n) each: one move at the beginning of each period."""
+        number = _move_numbers(t, period_s, self.positions)
         share = (t - STAND_S - period_s * number) / self.move_s
         blend, blend_dot, blend_ddot = (x[:, None] for x in quintic(share))
         step = np.diff(visits, axis=0)[number]
@@ -143,7 +143,7 @@ class _Drawn(RepeatableReference):
         return visits[number] + blend * step, q_dot, blend_ddot * step / self.move_s**2
 
 
-class Poses(_Drawn):
+class Poses(_RandomPoses):
     """Static poses, drawn over the workspace within limits.
 
     The robot moves there from home, and is scored at rest.
@@ -162,15 +162,15 @@ class Poses(_Drawn):
         """A plan of all joints, (T, n), from the first pose through the others."""
         period = self.move_s + self.settle_s + self.measure_s
         t = control_times(STAND_S + self.positions * period, period_s)
-        number = _numbers(t, period, self.positions)
+        number = _move_numbers(t, period, self.positions)
         since = t - STAND_S - period * number
         settled = self.move_s + self.settle_s
         is_at_rest = (since > settled + 1e-9) & (since <= period + 1e-9)
         rest = np.where(is_at_rest, number, -1)
-        return Plan(*self._moved(visits, t, period), is_at_rest, rest)
+        return Plan(*self._motion(visits, t, period), is_at_rest, rest)
 
 
-class Moves(_Drawn):
+class Moves(_RandomPoses):
     """Smooth moves from pose to pose, drawn over the workspace within limits, scored throughout."""
 
     kind: Literal["moves"] = "moves"
@@ -180,7 +180,7 @@ class Moves(_Drawn):
     def through(self, visits: Array, period_s: float) -> Plan:
         """A plan of all joints, (T, n), from the first pose through the others."""
         t = control_times(STAND_S + self.positions * self.move_s, period_s)
-        return _scored(t, *self._moved(visits, t, self.move_s))
+        return _moving_plan(t, *self._motion(visits, t, self.move_s))
 
 
 class _Path(RepeatableReference):
@@ -191,8 +191,8 @@ class _Path(RepeatableReference):
     repeats: int = quantity("1", 1, ge=1, le=100)
     """Number of ways there and back, or of turns [1]."""
 
-    def _along(self, workspace: Workspace, place: Any, t: Array, *phase: Array) -> Plan:
-        """Plan of joints whose tool moves by `place(s)` from its start, for s and its rates."""
+    def _plan_path(self, workspace: Workspace, place: Any, t: Array, *phase: Array) -> Plan:
+        """Make a plan whose tool moves by `place(s)` from its start, for s and its rates."""
         s, s_dot, s_ddot = phase
         tool = workspace.end_effector
         if tool is None:
@@ -205,7 +205,7 @@ class _Path(RepeatableReference):
         slope = path(s, 1)
         rate = s_dot[:, None]
         q_ddot = slope * s_ddot[:, None] + path(s, 2) * rate**2
-        return _scored(t, q, slope * rate, q_ddot)
+        return _moving_plan(t, q, slope * rate, q_ddot)
 
 
 class Line(_Path):
@@ -225,7 +225,7 @@ class Line(_Path):
         way_s = self.duration_s
         ways = 2 * self.repeats
         t = control_times(STAND_S + ways * way_s, period_s)
-        number = _numbers(t, way_s, ways)
+        number = _move_numbers(t, way_s, ways)
         is_back = number % 2 == 1
         phases = np.stack(quintic((t - STAND_S) / way_s - number))
         s, s_dot, s_ddot = np.where(is_back, -phases, phases)
@@ -234,7 +234,7 @@ class Line(_Path):
         def place(way: Array) -> Array:
             return way[..., None] * np.array(self.by)
 
-        return self._along(workspace, place, t, s, s_dot / way_s, s_ddot / way_s**2)
+        return self._plan_path(workspace, place, t, s, s_dot / way_s, s_ddot / way_s**2)
 
 
 class Circle(_Path):
@@ -253,8 +253,7 @@ class Circle(_Path):
         """A plan of all joints, (T, n)."""
         length = np.linalg.norm(self.normal)
         if not length > 0.0:
-            needed = "must have a length > 0, such as [0, 1, 0]"
-            raise ConfigurationError(f"normal of a circle {needed}")
+            raise ConfigurationError("normal of a circle must have a length > 0, such as [0, 1, 0]")
         axis = np.array(self.normal) / length
         down = np.cross(np.cross(axis, np.eye(3)[np.abs(axis).argmin()]), axis)
         across = np.cross(axis, down)
@@ -270,7 +269,7 @@ class Circle(_Path):
             return (np.cos(angle) - 1.0) * down + np.sin(angle) * across
 
         rate = n * s_dot / total
-        return self._along(workspace, place, t, n * s, rate, n * s_ddot / total**2)
+        return self._plan_path(workspace, place, t, n * s, rate, n * s_ddot / total**2)
 
 
 class Csv(RepeatableReference):
@@ -286,9 +285,9 @@ class Csv(RepeatableReference):
 
     def joint_plan(self, workspace: Workspace, period_s: float) -> Plan:
         """A plan of all joints, (T, n)."""
-        from scipy.interpolate import CubicSpline  # loads long, and few need it
+        from scipy.interpolate import CubicSpline  # imported late: it takes long, and few need it
 
-        names, rows = _table(Path(self.file), workspace.joints)
+        names, rows = _read_angles(Path(self.file), workspace.joints)
         times = rows[:, 0] - rows[0, 0]
         angles = np.tile(workspace.home, (len(rows), 1))
         angles[:, [workspace.joints.index(name) for name in names]] = rows[:, 1:]
@@ -297,7 +296,7 @@ class Csv(RepeatableReference):
         since = np.clip(t - STAND_S, 0.0, times[-1])
         moving = ((t > STAND_S) & (t < STAND_S + times[-1]))[:, None]
         q_dot = np.where(moving, path(since, 1), 0.0)
-        return _scored(t, path(since), q_dot, np.where(moving, path(since, 2), 0.0))
+        return _moving_plan(t, path(since), q_dot, np.where(moving, path(since, 2), 0.0))
 
 
 OfArm: TypeAlias = Poses | Moves | Line | Circle | Csv
@@ -305,13 +304,13 @@ AnyArmReference: TypeAlias = AnyReference | OfArm
 ArmReference = Annotated[AnyArmReference, Field(discriminator="kind")]
 
 make_arm_reference = partial(
-    references.make_reference, kinds=references.REFERENCES | references.by_kind(OfArm)
+    references.make_reference, kinds=references.REFERENCES | references.kinds_of(OfArm)
 )
-"""A reference of a robot of several joints; arguments as of `make_reference`."""
+"""Make a reference of a robot of several joints; arguments as in `make_reference`."""
 
 
 def motion_of(reference: AnyArmReference, workspace: Workspace) -> Motion:
-    """A reference as the joints of a robot follow it."""
+    """Return the motion of all joints of a robot by a reference."""
     return Motion(partial(_plan, reference, workspace), reference.is_random)
 
 
@@ -322,19 +321,19 @@ def _plan(
     period_s: float,
 ) -> Plan:
     if isinstance(reference, Poses | Moves):
-        own = reference.own(generator)
-        poses = workspace.poses(own, reference.positions, reference.within_rad)
+        chosen = reference.choose_generator(generator)
+        poses = workspace.poses(chosen, reference.positions, reference.within_rad)
         return reference.through(np.vstack([workspace.home, poses]), period_s)
     if isinstance(reference, OfArm):
         return reference.joint_plan(workspace, period_s)
-    return reference.about(workspace.home, generator, period_s)
+    return reference.plan_about(workspace.home, generator, period_s)
 
 
-def _table(file: Path, joints: tuple[str, ...]) -> tuple[list[str], Array]:
-    """Joints and rows of a user's file: time [s], then their angles [rad].
+def _read_angles(file: Path, joints: tuple[str, ...]) -> tuple[list[str], Array]:
+    """Read the joints and rows of a user's file: time [s], then their angles [rad].
 
     Raises:
-        ConfigurationError: It cannot be read, or a column or value is not what it has to be.
+        ConfigurationError: It cannot be read, or a column or value is invalid.
     """
     example = "time_s, then joints"
     names, rows = read_table(
@@ -353,21 +352,21 @@ def _table(file: Path, joints: tuple[str, ...]) -> tuple[list[str], Array]:
         raise ConfigurationError(
             f"time_s of {file} must increase from row to row, over at most {LONGEST_S:g} s"
         )
-    if np.diff(t).min() < _SHORTEST_S or np.abs(rows[:, 1:]).max() > _LARGEST_RAD:
+    if np.diff(t).min() < _LEAST_PERIOD_S or np.abs(rows[:, 1:]).max() > _LARGEST_RAD:
         raise ConfigurationError(
-            f"{file} must have rows at least {_SHORTEST_S:g} s apart, and angles within"
+            f"{file} must have rows at least {_LEAST_PERIOD_S:g} s apart, and angles within"
             f" ±{_LARGEST_RAD:g} rad"
         )
     return list(names[1:]), rows
 
 
-def _numbers(t: Array, period_s: float, count: int) -> IntArray:
-    """Which of the moves each time belongs to, (T,): one begins at the end of the one before."""
+def _move_numbers(t: Array, period_s: float, count: int) -> IntArray:
+    """Return the number of the move at each time, (T,); moves follow without pause."""
     past = np.ceil((t - STAND_S - 1e-9) / period_s) - 1.0
     return past.clip(0, count - 1).astype(np.int64)
 
 
-def _scored(t: Array, q: Array, q_dot: Array, q_ddot: Array) -> Plan:
-    """A plan that is scored from the end of the standing."""
+def _moving_plan(t: Array, q: Array, q_dot: Array, q_ddot: Array) -> Plan:
+    """Return a plan that is scored from the end of the standing."""
     scored: BoolArray = t > STAND_S
     return Plan(q, q_dot, q_ddot, scored, np.full(len(t), -1))

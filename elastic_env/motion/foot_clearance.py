@@ -1,4 +1,4 @@
-"""Feet that keep clear of each other: soles as rectangles, standing and while one swings."""
+"""Check that feet keep clear of each other: soles as rectangles, standing and swinging."""
 
 import numpy as np
 
@@ -7,12 +7,12 @@ from elastic_env.core.signals import Array
 from elastic_env.motion.gait import Footholds
 from elastic_env.rigid.leg_kinematics import turn
 
-_ALONG_A_SWING = 16
-"""Parts of a swing at whose ends the soles are compared."""
+_SWING_PARTS = 16
+"""Parts of a swing; the soles are compared at their ends."""
 
 
 def require_clear_feet(feet: Footholds, sole_half_size: tuple[float, float]) -> None:
-    """Refuse footholds at which soles cross or touch, or which a swing reaches only through one.
+    """Refuse footholds at which soles cross or touch, also during a swing.
 
     Args:
         feet: Footholds by step.
@@ -21,7 +21,7 @@ def require_clear_feet(feet: Footholds, sole_half_size: tuple[float, float]) -> 
     Raises:
         ConfigurationError: The left foot does not stay clear to the left of the right one.
     """
-    share = np.linspace(0.0, 1.0, _ALONG_A_SWING + 1)[:, None, None]
+    share = np.linspace(0.0, 1.0, _SWING_PARTS + 1)[:, None, None]
     before = feet.positions[:-1, None]
     yaw_before = feet.yaw[:-1, None]
     positions = before + share * (feet.positions[1:, None] - before)
@@ -37,9 +37,9 @@ def require_clear_feet(feet: Footholds, sole_half_size: tuple[float, float]) -> 
 
 
 def sole_gap(positions: Array, yaw: Array, half_size: tuple[float, float]) -> Array:
-    """Distance between two soles along the best of their sides, negative where they overlap.
+    """Return the gap between two soles along the best of their sides, negative for an overlap.
 
-    The right sole must lie to the right of a side of the left one, or in front of or behind it
+    The right sole must be to the right of a side of the left one, or in front of it or behind it
     with its middle to the right, and likewise the other way round.
 
     Args:

@@ -1,4 +1,4 @@
-"""A walk: step periods, phases, a foothold per step, and the ZMP reference that goes with them.
+"""Gait of a walk: step periods, phases, a foothold per step, and the ZMP reference.
 
 A step is double, single, double support; its support foot is fixed and the other one swings. The
 first step swings the right foot, as Fig. 1 of the paper. Before and after the walk the robot
@@ -81,7 +81,7 @@ class Gait(Model):
 
     @property
     def is_in_place(self) -> bool:
-        """The feet come down where they stood, side by side under the hips."""
+        """True if the feet come down where they stood, side by side under the hips."""
         return not (self.step_length_m or self.turn_rad or self.step_width_m)
 
     def _check(self) -> None:
@@ -101,7 +101,7 @@ class Gait(Model):
 def make_gait(
     step_period: "float | tuple[float, float, float] | list[float] | Gait", **parameters: Any
 ) -> Gait:
-    """A gait by its step period, or by the durations of double, single, double support [s].
+    """Make a gait from its step period, or the durations of double, single, double support [s].
 
     Args:
         step_period: 24, 3, 1.6 or 1.1 [s], or three durations [s], or a gait, which is returned.
@@ -133,14 +133,13 @@ class Timing:
 
     Attributes:
         time: Time from the start of the episode [s].
-        step: Number of the step, from 0 on; before and after the walk that of the next or last
-            step.
+        step: Number of the step, from 0 on; before the walk the first, after it the last.
         support: Support foot of that step, `LEFT` or `RIGHT`.
-        single: Whether the other foot is off the ground.
-        swing: Progress of the swing, 0 to 1; 0 and 1 before and after it.
-        transition: Within `TRANSITION_S` of a lift-off or touch-down.
-        walking: Whether it belongs to the walk.
-        scored: The walk without its settling steps.
+        single: True if the other foot is off the ground.
+        swing: Progress of the swing, 0 to 1; 0 before it and 1 after it.
+        transition: True within `TRANSITION_S` of a lift-off or touch-down.
+        walking: True during the walk.
+        scored: True during the walk without its settling steps.
     """
 
     time: Array
@@ -154,7 +153,7 @@ class Timing:
 
 
 def step_timing(gait: Gait, control_period_s: float) -> Timing:
-    """Phases of a gait.
+    """Return the phases of a gait.
 
     Raises:
         ConfigurationError: A duration is no multiple of the control period, or the walk is too
@@ -173,8 +172,8 @@ def step_timing(gait: Gait, control_period_s: float) -> Timing:
     time = control_times(gait.duration_s, control_period_s)
     begin = round(STAND_S / control_period_s)
     since = np.arange(len(time)) - begin  # control steps since the walk began
-    of_walk = np.clip((since - 1) // period, 0, gait.num_steps - 1)
-    within = since - of_walk * period - first  # control steps since lift-off
+    step = np.clip((since - 1) // period, 0, gait.num_steps - 1)
+    within = since - step * period - first  # control steps since lift-off
     swing = np.clip(within / single, 0.0, 1.0)
     around = int((TRANSITION_S + 1e-9) / control_period_s)
     transition = np.zeros(len(time), dtype=np.bool_)
@@ -184,19 +183,19 @@ def step_timing(gait: Gait, control_period_s: float) -> Timing:
     walking = (since > 0) & (since <= gait.num_steps * period)
     return Timing(
         time=time,
-        step=of_walk,
-        support=of_walk % 2,
+        step=step,
+        support=step % 2,
         single=(within > 0) & (within < single),
         swing=swing,
         transition=walking & transition,
         walking=walking,
-        scored=walking & (of_walk >= gait.settling_steps),
+        scored=walking & (step >= gait.settling_steps),
     )
 
 
 @dataclass(frozen=True, eq=False)
 class Footholds:
-    """Where the feet stand after 0, 1, ... steps, in the plan's world frame, left foot first.
+    """Places of the feet after 0, 1, ... steps, in the plan's world frame, left foot first.
 
     Attributes:
         positions: Middles of the soles, (num_steps + 1, 2, 2) [m].
@@ -207,10 +206,10 @@ class Footholds:
     positions: Array
     yaw: Array
 
-    def swinging(self, timing: Timing) -> tuple[Array, Array]:
-        """Middles of the soles, (T, 2, 2) [m], and headings, (T, 2) [rad], swings included.
+    def paths(self, timing: Timing) -> tuple[Array, Array]:
+        """Return middles of the soles, (T, 2, 2) [m], and headings, (T, 2) [rad], with swings.
 
-        A swing goes straight from foothold to foothold with minimum jerk.
+        A swing is a straight line from foothold to foothold with minimum jerk.
         """
         blend = minimum_jerk(timing.swing)[:, None]
         before = timing.step
@@ -222,11 +221,10 @@ class Footholds:
 
 
 def footholds(gait: Gait, feet: Array) -> Footholds:
-    """Footholds of a gait.
+    """Return the footholds of a gait.
 
-    A step takes its foot one step length and one turn further than the support foot: to where that
-    foot would stand beside the support foot, moved by the step length along the heading halfway
-    through the turn. The last step closes the feet side by side.
+    A step sets its foot beside the support foot, one turn further, then moves it by the step length
+    along the heading halfway through the turn. The last step closes the feet side by side.
 
     Args:
         gait: Step length, width and turn.
@@ -237,9 +235,9 @@ def footholds(gait: Gait, feet: Array) -> Footholds:
     if gait.step_width_m is not None:
         widths = np.array([0.5, -0.5]) * gait.step_width_m
         beside[:, 1] = feet[:, 1].mean() + widths
-    # of the pair of feet that a foot belongs to, one per foot that was set down
-    taken = np.arange(gait.num_steps)
-    yaw = np.concatenate([gait.turn_rad * taken, [gait.turn_rad * taken[-1]]])
+    # a pair of feet for each step, closed by the last one; a step sets one foot of a pair
+    turns = gait.turn_rad * np.arange(gait.num_steps)
+    yaw = np.append(turns, turns[-1])
     along = np.tile([gait.step_length_m, 0.0], (gait.num_steps - 1, 1))
     advance = turn(along, yaw[1:-1] - 0.5 * gait.turn_rad)
     middle = np.zeros((gait.num_steps + 1, 2))
@@ -254,7 +252,7 @@ def footholds(gait: Gait, feet: Array) -> Footholds:
 
 
 def zmp_reference(gait: Gait, timing: Timing, feet: Footholds) -> Array:
-    """Reference of the zero moment point.
+    """Return the reference of the zero moment point.
 
     Args:
         gait: Durations and kind of transfer.
@@ -275,7 +273,7 @@ def zmp_reference(gait: Gait, timing: Timing, feet: Footholds) -> Array:
 
 
 def inward_offsets(gait: Gait, standing: Array) -> Array:
-    """From the middles of the soles to the ZMP on one foot, in the frames of the feet, (2, 2) [m].
+    """Return the ZMP on one foot from the middle of its sole, in the foot's frame, (2, 2) [m].
 
     Args:
         gait: Kind of transfer.
@@ -287,7 +285,7 @@ def inward_offsets(gait: Gait, standing: Array) -> Array:
 
 
 def _shifts(gait: Gait, feet: Footholds) -> list[_Shift]:
-    """Moves of the ZMP: begin [s], duration [s], from and to [m]."""
+    """Return the moves of the ZMP: begin [s], duration [s], from and to [m]."""
     shifts: list[_Shift] = []
     middles = feet.positions.mean(axis=1)
     offsets = inward_offsets(gait, feet.positions[0])
@@ -303,8 +301,8 @@ def _shifts(gait: Gait, feet: Footholds) -> list[_Shift]:
             shifts.append((lift_off - _RAMP_SHIFT_S, _RAMP_SHIFT_S, middles[step], support))
             shifts.append((touch_down, _RAMP_SHIFT_S, support, middles[step + 1]))
         else:
-            left = begin if step == 0 else begin - gait.last_double_support_s
-            shifts.append((left, lift_off - left, last, support))
+            start = begin if step == 0 else begin - gait.last_double_support_s
+            shifts.append((start, lift_off - start, last, support))
             if step == gait.num_steps - 1:
                 shifts.append((touch_down, end - touch_down, support, middles[-1]))
         last = support

@@ -1,4 +1,4 @@
-"""Joint angles whose end effector follows a path, by Newton's method from point to point."""
+"""Inverse kinematics of a path of the end effector, by Newton's method from point to point."""
 
 from collections.abc import Callable
 from typing import Any
@@ -11,60 +11,61 @@ from elastic_env.rigid.tree.end_effector import EndEffector
 
 _POINTS = 100
 """Points of a path per unit of its parameter."""
-_ENOUGH = 1e-9
+_TOLERANCE = 1e-9
+"""Largest error of position [m] and rotation [rad]."""
 _MOST_STEPS = 50
 _LARGEST_JUMP_RAD = 0.3
-"""Between two points of a path; a larger one is a singular posture."""
+"""Largest change between two points of a path; a larger one is a singular posture."""
 _DAMPING = 1e-12
-_FOR_ORIENTATION = 6
+_ORIENTATION_JOINTS = 6
 """Joints that a robot needs to keep the orientation of its tool."""
 
 
 def joint_path(tool: EndEffector, home: Array, place: Callable[[Array], Array], end: float) -> Any:
-    """Spline of joint angles along a path of the end effector, from (...) to (..., n) [rad].
+    """Return a spline of joint angles along a path of the tool, from (...) to (..., n) [rad].
 
     Args:
         tool: The end effector.
         home: Joint angles at the start, (n,) [rad].
-        place: Where the end effector is relative to its start, from (...) to (..., 3) [m].
+        place: Place of the end effector from its start, from (...) to (..., 3) [m].
         end: Last value of the path's parameter, which starts at 0.
 
     Raises:
         ConfigurationError: The path leaves the workspace, or leads through a singular posture.
     """
-    # here: most programs need no spline, and it loads for a quarter of a second
+    # imported late: it takes a quarter of a second, and most programs need no spline
     from scipy.interpolate import CubicSpline
 
     s = np.linspace(0.0, end, int(np.ceil(_POINTS * end)) + 1)
     start, R = tool.pose(home)
     angles = [home]
     for at, offset in zip(s[1:], place(s[1:]), strict=True):
-        found = _solved(tool, angles[-1], start + offset, R)
-        if found is None or np.abs(found - angles[-1]).max() > _LARGEST_JUMP_RAD:
+        q = _solve_pose(tool, angles[-1], start + offset, R)
+        if q is None or np.abs(q - angles[-1]).max() > _LARGEST_JUMP_RAD:
             raise ConfigurationError(
                 f"the end effector cannot follow the path beyond {100 * at / end:.0f} % of it,"
                 f" {offset.round(3).tolist()} m from its start: out of reach, or a singular"
                 " posture; choose a smaller path or another home"
             )
-        angles.append(found)
+        angles.append(q)
     return CubicSpline(s, np.array(angles))
 
 
-def _solved(tool: EndEffector, q: Array, place: Array, R_wanted: Array) -> Array | None:
-    """Angles near q that reach a place; six joints or more keep the orientation. None for none."""
+def _solve_pose(tool: EndEffector, q: Array, place: Array, R_ref: Array) -> Array | None:
+    """Find angles near q that reach a place, or None; six joints or more keep the orientation."""
     from scipy.spatial.transform import Rotation
 
-    keeps = len(q) >= _FOR_ORIENTATION
+    keeps_orientation = len(q) >= _ORIENTATION_JOINTS
     for _ in range(_MOST_STEPS):
         position, R = tool.pose(q)
         error = place - position
-        if keeps:
-            turn = Rotation.from_matrix(R_wanted @ R.T).as_rotvec()
+        if keeps_orientation:
+            turn = Rotation.from_matrix(R_ref @ R.T).as_rotvec()
             error = np.concatenate([error, turn])
-        if np.abs(error).max() < _ENOUGH:
+        if np.abs(error).max() < _TOLERANCE:
             return q
-        moved, turned = tool.jacobian(q)
-        J = np.concatenate([moved, turned]) if keeps else moved
+        J_position, J_rotation = tool.jacobian(q)
+        J = np.concatenate([J_position, J_rotation]) if keeps_orientation else J_position
         step: Array = J.T @ np.linalg.solve(J @ J.T + _DAMPING * np.eye(len(J)), error)
         q = q + step
     return None

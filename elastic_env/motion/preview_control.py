@@ -38,7 +38,7 @@ class PreviewConfig(Model):
 
 @dataclass(frozen=True)
 class PreviewGains:
-    """Gains on the integrated ZMP error, the state (x, ẋ, ẍ), and the previewed references."""
+    """Gains on the integrated ZMP error, the state (x, ẋ, ẍ), and the reference in preview."""
 
     integral: float
     state: Array
@@ -65,7 +65,7 @@ def cart_table(config: PreviewConfig) -> tuple[Array, Array, Array]:
 
 
 def preview_gains(config: PreviewConfig) -> PreviewGains:
-    """Optimal gains from the discrete Riccati equation of the incremental system [Katayama1985]."""
+    """Compute optimal gains by the Riccati equation of the incremental system [Katayama1985]."""
     A, b, c = cart_table(config)
     Phi = np.block([[np.ones((1, 1)), (c @ A)[None]], [np.zeros((3, 1)), A]])
     G = np.concatenate([[c @ b], b])[:, None]
@@ -85,11 +85,11 @@ def preview_gains(config: PreviewConfig) -> PreviewGains:
 
 
 def follow_zmp(config: PreviewConfig, zmp_ref: Array, start: Array) -> ComMotion:
-    """Motion of the center of mass whose ZMP follows a reference, from rest.
+    """Compute the motion of the center of mass whose ZMP follows a reference, from rest.
 
     Args:
         config: Model and weights.
-        zmp_ref: Reference at the control rate, (T, d) [m]; its last row is held beyond the end.
+        zmp_ref: Reference at the control rate, (T, d) [m]; its last row continues beyond the end.
         start: Position of the center of mass at rest, (d,) [m].
 
     Returns:
@@ -99,15 +99,16 @@ def follow_zmp(config: PreviewConfig, zmp_ref: Array, start: Array) -> ComMotion
         ElasticError: Shapes that do not fit.
     """
     if zmp_ref.ndim != 2 or start.shape != zmp_ref.shape[1:]:
-        given = f"{zmp_ref.shape} and {start.shape}"
-        raise ElasticError(f"zmp_ref must be (T, d) and start (d,), got {given}")
+        raise ElasticError(
+            f"zmp_ref must be (T, d) and start (d,), got {zmp_ref.shape} and {start.shape}"
+        )
     A, b, c = cart_table(config)
     gains = preview_gains(config)
     steps, dimensions = zmp_ref.shape
     reach = len(gains.preview)
-    held = np.repeat(zmp_ref[-1:], reach + 1, axis=0)
-    # coming[k] = r_{k+1} − r_k
-    coming = np.diff(np.concatenate([zmp_ref, held]), axis=0)
+    continuation = np.repeat(zmp_ref[-1:], reach + 1, axis=0)
+    # steps_ahead[k] = r_{k+1} − r_k
+    steps_ahead = np.diff(np.concatenate([zmp_ref, continuation]), axis=0)
     state = np.zeros((3, dimensions))
     state[0] = start
     last = state
@@ -116,12 +117,12 @@ def follow_zmp(config: PreviewConfig, zmp_ref: Array, start: Array) -> ComMotion
     for k in range(steps):
         states[k] = state
         error = c @ state - zmp_ref[k]
-        # in increments, as the servo is optimal: all of the preview is known from the first step on
+        # in increments, for which the servo is optimal: it knows the preview from the first step on
         jerk = (
             jerk
             - gains.integral * error
             - gains.state @ (state - last)
-            - gains.preview @ coming[k : k + reach]
+            - gains.preview @ steps_ahead[k : k + reach]
         )
         last = state
         state = A @ state + b[:, None] * jerk

@@ -1,8 +1,8 @@
 """Reference trajectories of the testbed: static positions, sine, multisine, steps.
 
-A reference is a validated model; `plan` turns it into samples at the control rate, with rate and
-acceleration in closed form. Every plan begins with a second of standing, in which policies ramp in,
-and moves by quintic (minimum-jerk) polynomials, which start and end without acceleration.
+A reference is a validated model. Its method `plan` returns samples at the control rate, with rate
+and acceleration in closed form. Every plan begins with a second of standing, in which policies ramp
+in, and moves by quintic (minimum-jerk) polynomials, which start and end without acceleration.
 """
 
 from collections.abc import Mapping
@@ -31,15 +31,15 @@ _LONGEST_SUM_S = 36_000.0
 
 
 class RepeatableReference(Model):
-    """A reference, whose plans repeat unless it has a seed that is None: then each is new."""
+    """A reference whose plans repeat, unless it has a field `seed` that is None."""
 
     @property
     def is_random(self) -> bool:
-        """True where every episode has a plan of its own."""
+        """True if every episode has a plan of its own."""
         return getattr(self, "seed", 0) is None
 
-    def own(self, generator: Generator) -> Generator:
-        """Its own generator where it has a seed, or the one that is given."""
+    def choose_generator(self, generator: Generator) -> Generator:
+        """Return a generator of the reference's seed, or the given one without a seed."""
         seed: int | None = getattr(self, "seed", None)
         return generator if seed is None else np.random.default_rng(seed)
 
@@ -48,24 +48,24 @@ class _JointReference(RepeatableReference):
     """A motion of one joint."""
 
     def plan(self, generator: Generator, control_period_s: float) -> Plan:
-        """A plan by the draws of a generator, or of the reference's own seed."""
+        """Make a plan by the draws of a generator, or of the reference's own seed."""
         raise NotImplementedError
 
     def extent(self) -> Extent:
-        """Bounds over all its plans."""
+        """Return bounds over all its plans."""
         raise NotImplementedError
 
-    def about(self, home: Array, generator: Generator, period_s: float) -> Plan:
-        """A plan of joints that all follow it about their home, (n,) [rad].
+    def plan_about(self, home: Array, generator: Generator, period_s: float) -> Plan:
+        """Make a plan of joints that all follow the reference about their home, (n,) [rad].
 
-        Of a random one each joint has a plan of its own.
+        If the reference is random, each joint has a plan of its own.
         """
         first = self.plan(generator, period_s)
         plans = [first] * len(home)
         if self.is_random:
             plans[1:] = [self.plan(generator, period_s) for _ in plans[1:]]
         motions = [(plan.q, plan.q_dot, plan.q_ddot) for plan in plans]
-        q, q_dot, q_ddot = (np.stack(own, axis=-1) for own in zip(*motions, strict=True))
+        q, q_dot, q_ddot = (np.stack(part, axis=-1) for part in zip(*motions, strict=True))
         return Plan(q + home, q_dot, q_ddot, first.scored, first.rest)
 
 
@@ -104,8 +104,9 @@ class Hold(_JointReference):
 
     def _check(self) -> None:
         if self.upper <= self.lower:
-            given = f"lower {self.lower} and upper {self.upper}"
-            raise ValueError(f"upper must exceed lower, got {given}")
+            raise ValueError(
+                f"upper must exceed lower, got lower {self.lower} and upper {self.upper}"
+            )
 
     @property
     def angles(self) -> Array:
@@ -115,7 +116,7 @@ class Hold(_JointReference):
 
     @property
     def visits(self) -> tuple[Array, IntArray]:
-        """Angle [rad] of each window at rest, and +1 if approached from below, else −1."""
+        """Angle [rad] of each rest, and +1 if approached from below, else −1."""
         angles = self.angles
         directions = np.repeat(np.array([1, -1]), len(angles))
         return np.concatenate([angles, angles[::-1]]), directions
@@ -133,7 +134,7 @@ class Hold(_JointReference):
         )
 
     def _move_s(self, distance: float) -> float:
-        """Duration of a move over a distance [rad]."""
+        """Return the duration of a move over a distance [rad]."""
         return max(QUINTIC_PEAK_RATE * distance / self.rate, self.shortest_move_s)
 
     @override
@@ -143,16 +144,16 @@ class Hold(_JointReference):
         targets = np.insert(angles, self.positions, self.angles[-1] + self.overrun)
         moves = []
         windows = []
-        now = STAND_S
+        time = STAND_S
         for number, distance in enumerate(np.abs(np.diff(targets, prepend=start))):
             duration = self._move_s(distance)
-            moves.append((now, duration, targets[number]))
-            now = now + duration
-            if number != self.positions:  # there it turns round
-                begin = now + self.settle_s
-                now = begin + self.measure_s
-                windows.append((begin, now))
-        t = control_times(now, control_period_s)
+            moves.append((time, duration, targets[number]))
+            time = time + duration
+            if number != self.positions:  # the target of this number is the turn
+                begin = time + self.settle_s
+                time = begin + self.measure_s
+                windows.append((begin, time))
+        t = control_times(time, control_period_s)
         q, q_dot, q_ddot = quintic_moves(t, start, moves)
         rest = np.full(len(t), -1)
         for visit, (begin, end) in enumerate(windows):
@@ -172,7 +173,7 @@ class _Oscillation(_JointReference):
     onset_s: float = quantity("s", 2.0, gt=0, le=3600)
     """Time in which the amplitude grows; not scored [s]."""
 
-    def _enveloped(self, t: Array, x: Array, x_dot: Array, x_ddot: Array) -> Plan:
+    def _plan_with_onset(self, t: Array, x: Array, x_dot: Array, x_ddot: Array) -> Plan:
         w, w_dot, w_ddot = quintic((t - STAND_S) / self.onset_s)
         w_dot = w_dot / self.onset_s
         w_ddot = w_ddot / self.onset_s**2
@@ -183,7 +184,7 @@ class _Oscillation(_JointReference):
         return Plan(q, q_dot, q_ddot, scored, np.full(len(t), -1))
 
     def _extent(self, rate: float, acceleration: float) -> Extent:
-        """Bounds with the envelope, whatever the phase of the oscillation when it grows."""
+        """Return bounds with the envelope, for any phase of the oscillation during its growth."""
         w, w_dot, w_ddot = quintic(np.linspace(0.0, 1.0, 1001))
         w_dot = w_dot / self.onset_s
         w_ddot = np.abs(w_ddot) / self.onset_s**2
@@ -216,7 +217,7 @@ class Sine(_Oscillation):
         phase = omega * (t - STAND_S)
         x = self.amplitude * np.sin(phase)
         x_dot = self.amplitude * omega * np.cos(phase)
-        return self._enveloped(t, x, x_dot, -(omega**2) * x)
+        return self._plan_with_onset(t, x, x_dot, -(omega**2) * x)
 
 
 class Multisine(_Oscillation):
@@ -239,8 +240,9 @@ class Multisine(_Oscillation):
 
     def _check(self) -> None:
         if self.highest_hz <= self.lowest_hz:
-            given = f"{self.lowest_hz} to {self.highest_hz} Hz"
-            raise ValueError(f"highest_hz must exceed lowest_hz, got {given}")
+            raise ValueError(
+                f"highest_hz must exceed lowest_hz, got {self.lowest_hz} to {self.highest_hz} Hz"
+            )
         if self.components * self.duration_s > _LONGEST_SUM_S:
             raise ValueError(
                 f"components x duration_s must be at most {_LONGEST_SUM_S:g} s, got"
@@ -260,7 +262,7 @@ class Multisine(_Oscillation):
 
     @override
     def plan(self, generator: Generator, control_period_s: float) -> Plan:
-        phases = self.own(generator).uniform(0.0, 2.0 * np.pi, self.components)
+        phases = self.choose_generator(generator).uniform(0.0, 2.0 * np.pi, self.components)
         t = self._time_base(control_period_s)
         omega = self._omega
         share = self.amplitude / self.components
@@ -268,7 +270,7 @@ class Multisine(_Oscillation):
         x = share * np.sin(angle).sum(axis=1)
         x_dot = share * (omega * np.cos(angle)).sum(axis=1)
         x_ddot = -share * (omega**2 * np.sin(angle)).sum(axis=1)
-        return self._enveloped(t, x, x_dot, x_ddot)
+        return self._plan_with_onset(t, x, x_dot, x_ddot)
 
 
 class Steps(_JointReference):
@@ -298,7 +300,7 @@ class Steps(_JointReference):
     @override
     def plan(self, generator: Generator, control_period_s: float) -> Plan:
         reach = self.amplitude
-        offsets = self.own(generator).uniform(-reach, reach, self.moves)
+        offsets = self.choose_generator(generator).uniform(-reach, reach, self.moves)
         period = self.move_s + self.rest_s
         moves = [
             (STAND_S + i * period, self.move_s, float(self.middle + x))
@@ -313,19 +315,19 @@ AnyReference: TypeAlias = Hold | Sine | Multisine | Steps
 Reference = Annotated[AnyReference, Field(discriminator="kind")]
 
 
-def by_kind(union: Any) -> dict[str, Any]:
-    """Classes of a union of references by the names of their kinds."""
-    return {one.model_fields["kind"].default: one for one in get_args(union)}
+def kinds_of(union: Any) -> dict[str, Any]:
+    """Return the classes of a union of references by the names of their kinds."""
+    return {model.model_fields["kind"].default: model for model in get_args(union)}
 
 
-REFERENCES = by_kind(AnyReference)
+REFERENCES = kinds_of(AnyReference)
 
 
 def make_reference(reference: Any, kinds: Mapping[str, Any] = REFERENCES) -> Any:
-    """A reference from its name, from a mapping with `kind` and parameters, or as it is.
+    """Make a reference from its name, or from a mapping with `kind` and parameters.
 
     Args:
-        reference: Such.
+        reference: Name, mapping, or a reference, which is returned.
         kinds: Classes of references by their names; default those that move every joint alike.
 
     Raises:

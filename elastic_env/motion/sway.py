@@ -1,4 +1,4 @@
-r"""Natural frequencies of a robot that stands on both feet, on its springs, its motors held.
+r"""Natural frequencies of a robot that stands on both feet, on its springs, with fixed motors.
 
 With both soles fixed, the pelvis pose x (position and small rotation, 6) determines the joint
 angles q(x). About the equilibrium, with the motors at θ = q + K⁻¹τ,
@@ -21,13 +21,13 @@ _STEP = 1e-4  # of the finite differences [m], [rad]
 def sway_frequencies(
     biped: Biped, pelvis: Array, stiffness: Array, ankles: Array | None = None
 ) -> Array:
-    """Natural frequencies of the robot standing with level pelvis, its weight shared equally.
+    """Return the natural frequencies of a robot at rest: level pelvis, weight shared equally.
 
     Args:
         biped: The robot.
         pelvis: Position of the pelvis over the middle between the soles, (3,) [m].
         stiffness: K of the twelve joints, (12,) [N·m/rad].
-        ankles: Of both feet, (2, 3) [m]; None for feet under the hips.
+        ankles: Ankles of both feet, (2, 3) [m]; None for feet under the hips.
 
     Returns:
         The six angular frequencies, ascending, (6,) [rad/s]; nan for one that gravity makes
@@ -47,8 +47,8 @@ def sway_frequencies(
         angles = angles_at(x)
         com = biped.chains.center_of_mass(angles)
         height = pelvis[2] + x[:, 2] + (_rotations(x) @ com[..., None])[:, 2, 0]
-        of_springs = 0.5 * (stiffness * (theta - angles) ** 2).sum(axis=1)
-        return of_springs + biped.weight * height
+        spring_energy = 0.5 * (stiffness * (theta - angles) ** 2).sum(axis=1)
+        return spring_energy + biped.weight * height
 
     unit = _STEP * np.eye(_DOF)
     pairs = unit[:, None] + unit[None]
@@ -70,7 +70,7 @@ def _rotations(x: Array) -> Array:
 
 
 def _angles(biped: Biped, pelvis: Array, ankles: Array, x: Array) -> Array:
-    """Joint angles that keep both soles on the ground, small pelvis motions (n, 6) to (n, 12)."""
+    """Return joint angles that keep both soles on the ground, from pelvis motions (n, 6)."""
     R = _rotations(x)
     relative = (ankles - (pelvis + x[:, :3])[:, None]) @ R - biped.hips
     turned = np.broadcast_to(R.swapaxes(-1, -2)[:, None], (len(x), 2, 3, 3))

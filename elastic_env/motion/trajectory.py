@@ -11,7 +11,7 @@ from elastic_env.core.signals import Array, BoolArray, IntArray
 STAND_S = 1.0
 """Time at the first position in which policies ramp in; not scored."""
 LONGEST_S = 7200.0
-"""Longest motion after it [s]: tables hold every control step."""
+"""Longest motion after the standing [s]: tables hold every control step."""
 
 QUINTIC_PEAK_RATE = 15.0 / 8.0
 QUINTIC_PEAK_ACCELERATION = 10.0 / np.sqrt(3.0)
@@ -27,7 +27,7 @@ class Plan:
         q, q_dot, q_ddot: Angle, rate, acceleration of the link, (T,), or of all links, (T, n)
             [rad], [rad/s], [rad/s²].
         scored: Rows that count in metrics, (T,).
-        rest: Number of the window at rest of `Hold`, −1 elsewhere, (T,).
+        rest: Number of the rest of `Hold` or `Poses` that is measured, −1 elsewhere, (T,).
     """
 
     q: Array
@@ -58,13 +58,13 @@ class Extent:
 
 
 def minimum_jerk(s: Array) -> Array:
-    """Minimum-jerk blend 10s³ − 15s⁴ + 6s⁵ from 0 to 1, s clipped to [0, 1]."""
+    """Return the minimum-jerk blend 10s³ − 15s⁴ + 6s⁵ from 0 to 1, s clipped to [0, 1]."""
     s = np.clip(s, 0.0, 1.0)
     return s**3 * (10.0 - 15.0 * s + 6.0 * s**2)
 
 
 def quintic(s: Array) -> tuple[Array, Array, Array]:
-    """`minimum_jerk` and its first two derivatives by s, s clipped to [0, 1]."""
+    """Return `minimum_jerk` and its first two derivatives by s, s clipped to [0, 1]."""
     blend = minimum_jerk(s)
     s = np.clip(s, 0.0, 1.0)
     rate = 30.0 * s**2 * (1.0 - s) ** 2
@@ -74,14 +74,13 @@ def quintic(s: Array) -> tuple[Array, Array, Array]:
 def quintic_moves(
     t: Array, start: float, moves: list[tuple[float, float, float]]
 ) -> tuple[Array, Array, Array]:
-    """Angle, rate, acceleration of moves in a row: begin [s], duration [s], target [rad]."""
+    """Return angle, rate, acceleration of moves in a row: begin [s], duration [s], target [rad]."""
     q = np.full_like(t, start)
     q_dot = np.zeros_like(t)
     q_ddot = np.zeros_like(t)
     position = start
     for begin, duration, target in moves:
-        # before a move nothing of it adds to the angle, after it all does: the rest would cost time
-        # alone
+        # a move changes only the rows within it; after it the whole move is added
         last = int(np.searchsorted(t, begin + duration)) + 1
         within = slice(int(np.searchsorted(t, begin)), last)
         blend, blend_dot, blend_ddot = quintic((t[within] - begin) / duration)
@@ -94,10 +93,10 @@ def quintic_moves(
 
 
 def control_times(duration_s: float, control_period_s: float) -> Array:
-    """Ends of the control periods within a duration, from 0 [s].
+    """Return the ends of the control periods within a duration, from 0 [s].
 
     Raises:
-        ConfigurationError: It is longer than `LONGEST_S` after the standing.
+        ConfigurationError: The duration is longer than `LONGEST_S` after the standing.
     """
     if duration_s > STAND_S + LONGEST_S:
         raise ConfigurationError(
@@ -107,13 +106,22 @@ def control_times(duration_s: float, control_period_s: float) -> Array:
     return np.arange(round(duration_s / control_period_s) + 1) * control_period_s
 
 
+def derivatives(samples: Array, period_s: float) -> tuple[Array, Array]:
+    """Return first and second derivative by central differences, time first; zero at the ends."""
+    first = np.zeros_like(samples)
+    second = np.zeros_like(samples)
+    first[1:-1] = (samples[2:] - samples[:-2]) / (2.0 * period_s)
+    second[1:-1] = (samples[2:] - 2.0 * samples[1:-1] + samples[:-2]) / period_s**2
+    return first, second
+
+
 @dataclass(frozen=True)
 class Motion:
-    """A reference as all joints of a robot follow it, whose plans have one length.
+    """A reference for all joints of a robot. All its plans have the same length.
 
     Attributes:
         plan: Makes a plan of all joints, (T, n), from a generator and the control period [s].
-        is_random: True where every episode has a plan of its own; else no plan depends on the
+        is_random: True if every episode has its own plan; else plans do not depend on the
             generator.
     """
 
@@ -122,24 +130,23 @@ class Motion:
 
 
 LARGEST_TABLE = 500_000_000
-"""Memory of the plans of all worlds [B]: 64 worlds of six joints for 100 s take half of it."""
+"""Largest memory of all plans [B]: 64 worlds of six joints for 100 s take half of it."""
 
 
 class PlanTable:
-    """Plans of all worlds as tables, one row per control step; one that repeats is held once.
+    """Plans of all worlds as tables, one row per control step; a repeated plan is stored once.
 
     Args:
-        motion: Of all joints.
+        motion: Motion of all joints.
         period_s: Time between commands [s].
-        num_worlds: How many.
+        num_worlds: Number of worlds.
 
     Raises:
         ConfigurationError: No step is scored, or the tables would take more than `LARGEST_TABLE`.
 
     Attributes:
-        motion: Angle, rate and acceleration of all joints, a plan after the other, (plans, T, 3,
-            n).
-        plan_of_world: Which plan each world follows, (num_worlds,).
+        motion: Angle, rate and acceleration of all joints, (plans, T, 3, n).
+        plan_of_world: Number of the plan of each world, (num_worlds,).
         scored, rest: As in a `Plan`, the same for all, (T,).
     """
 
@@ -154,8 +161,8 @@ class PlanTable:
                 f" period of {period_s} s; lengthen it"
             )
         plans = num_worlds if motion.is_random else 1
-        one = _stacked(probe)
-        size = plans * one.nbytes
+        rows = _motion_rows(probe)
+        size = plans * rows.nbytes
         if size > LARGEST_TABLE:
             raise ConfigurationError(
                 f"{plans} motions of {self.num_steps} control steps take {size / 1e6:.0f} MB,"
@@ -163,16 +170,16 @@ class PlanTable:
                 " episodes, or one motion for all by `seed`"
             )
         self.plan_of_world = np.arange(num_worlds) % plans
-        self.motion = np.tile(one, (plans, 1, 1, 1))
+        self.motion = np.tile(rows, (plans, 1, 1, 1))
         self.scored = probe.scored
         self.rest = probe.rest
 
     def draw(self, world: int, generator: np.random.Generator) -> None:
-        """A new plan for one world."""
+        """Draw a new plan for one world."""
         if self._motion.is_random:
-            self.motion[world] = _stacked(self._motion.plan(generator, self._period))
+            self.motion[world] = _motion_rows(self._motion.plan(generator, self._period))
 
 
-def _stacked(plan: Plan) -> Array:
-    """Angle, rate and acceleration of a plan, (T, 3, n)."""
+def _motion_rows(plan: Plan) -> Array:
+    """Return angle, rate and acceleration of a plan, (T, 3, n)."""
     return np.stack([plan.q, plan.q_dot, plan.q_ddot], axis=1)

@@ -1,17 +1,17 @@
-"""The walk as a table: gait, footholds, ZMP, center of mass, pelvis, feet and joint angles.
+"""Plan of a walk as a table: footholds, ZMP, center of mass, pelvis, feet and joint angles.
 
-The pelvis stays level at one height, heads where the feet do on average, and moves so that the
-center of mass of the whole robot, not the pelvis, follows the preview control.
+The pelvis stays level at one height, with the mean heading of the feet. It moves so that the center
+of mass of the whole robot follows the preview control.
 
-Legs that swing move the ZMP off that of the cart-table, by 2.5 mm rms in steps of 3 s and by 9 mm
-in steps of 1.1 s. The error of the motion's ZMP can pass the preview control once more
-[Kajita2003], which leaves about a seventh of it. Where the robot does not walk in place, the plan
-is that. A policy can walk a plan that is refined once more (`baselines.walking.foothold`).
+Swinging legs move the ZMP away from that of the cart-table, by 2.5 mm rms in steps of 3 s and by
+9 mm in steps of 1.1 s. A second pass of the preview control on the error of the ZMP [Kajita2003]
+leaves about a seventh of it. Plans of a robot that does not walk in place have this second pass. A
+policy can walk a plan with a further pass (`baselines.walking.foothold`).
 
 The plan's world frame: x forward at the start, y left, z up, the origin on the ground halfway
 between the feet at the start. The local frame, in which policies read the plan: level, on the
-ground halfway between the planned feet, x along the planned heading, which is the mean of theirs.
-It moves and turns with a swing foot by half. Where the robot walks in place, both are the same.
+ground halfway between the planned feet, x along their mean heading. It moves and turns by half as
+much as a swing foot. Where the robot walks in place, both frames are the same.
 
 [Kajita2003] S. Kajita et al., "Biped Walking Pattern Generation by using Preview Control of
 Zero-Moment Point", ICRA.
@@ -29,8 +29,10 @@ from elastic_env.motion import gait as gaits
 from elastic_env.motion.foot_clearance import require_clear_feet
 from elastic_env.motion.gait import RIGHT, Footholds, Gait, Timing
 from elastic_env.motion.preview_control import PreviewConfig, follow_zmp
+from elastic_env.motion.trajectory import derivatives
+from elastic_env.motion.walk_dynamics import Feet, walk_torque, walk_dynamics
 from elastic_env.rigid.biped import Biped
-from elastic_env.rigid.contact_force import contact_points, load_share, shares
+from elastic_env.rigid.contact_force import load_share
 from elastic_env.rigid.leg_kinematics import turn
 
 _COM_TOLERANCE_M = 1e-10
@@ -43,7 +45,7 @@ class LocalPlan:
 
     Attributes:
         com: Center of mass in the plane, (T, 2) [m].
-        com_dot: Its rate against the feet that stand, (T, 2) [m/s].
+        com_dot: Its rate relative to the support foot, (T, 2) [m/s].
         pelvis: Position of the pelvis, (T, 3) [m].
         ankles: Left and right ankle, (T, 2, 3) [m].
         foot_yaw: Headings of the feet, (T, 2) [rad].
@@ -64,9 +66,9 @@ class WalkPlan:
     see the module.
 
     Attributes:
-        gait: What was planned.
+        gait: Gait of the plan.
         timing: Phases.
-        footholds: Where the feet stand, by step.
+        footholds: Footholds by step.
         q, q_dot, q_ddot: Joint angles and their derivatives, (T, 12) [rad], [rad/s], [rad/s²].
         zmp: Reference of the ZMP, (T, 2) [m].
         zmp_of_motion: ZMP of the planned motion by inverse dynamics, (T, 2) [m].
@@ -142,8 +144,8 @@ def plan_walk(gait: Gait, biped: Biped, control_period_s: float) -> WalkPlan:
     """Plan a walk; every plan is computed once.
 
     Args:
-        gait: What to walk.
-        biped: The robot as it is assumed.
+        gait: Gait.
+        biped: The assumed robot.
         control_period_s: Time between rows [s].
 
     Raises:
@@ -156,8 +158,8 @@ def plan_walk(gait: Gait, biped: Biped, control_period_s: float) -> WalkPlan:
         require_clear_feet(footholds, biped.sole_half_size)
     feet = _foot_paths(gait, timing, footholds, biped)
     zmp = gaits.zmp_reference(gait, timing, footholds)
-    first = _Feet(feet.ankles[:1], feet.yaw[:1], feet.heading[:1])
-    standing, com_height = _standing(gait, biped, zmp[0], first)
+    first = Feet(feet.ankles[:1], feet.yaw[:1], feet.heading[:1])
+    standing, com_height = _standing_pelvis(gait, biped, zmp[0], first)
     preview = PreviewConfig(
         com_height_m=com_height, period_s=control_period_s, gravity=biped.gravity
     )
@@ -165,12 +167,12 @@ def plan_walk(gait: Gait, biped: Biped, control_period_s: float) -> WalkPlan:
     start = turn(np.tile(standing, (len(zmp), 1)), feet.heading)
     start[:, :2] += feet.ankles[..., :2].mean(axis=1)
     pelvis = _pelvis_under(motion.com, start, biped, feet, timing.time)
-    q = _angles(biped, pelvis, feet, timing.time)
-    dynamics = _dynamics(biped, pelvis, feet.heading, q, control_period_s)
+    q = _joint_angles(biped, pelvis, feet, timing.time)
+    dynamics = walk_dynamics(biped, pelvis, feet.heading, q, control_period_s)
     q_dot, q_ddot = derivatives(q, control_period_s)
     offsets = turn(gaits.inward_offsets(gait, footholds.positions[0]), feet.yaw)
     share = load_share(zmp, feet.ankles[..., :2] + offsets)
-    torque = _joint_torque(biped, feet, q, dynamics, share)
+    torque = walk_torque(biped, feet, q, dynamics, share)
     plan = WalkPlan(
         gait=gait,
         timing=timing,
@@ -197,13 +199,13 @@ def plan_walk(gait: Gait, biped: Biped, control_period_s: float) -> WalkPlan:
 
 @lru_cache(maxsize=32)
 def refine_plan(plan: WalkPlan, biped: Biped, control_period_s: float) -> WalkPlan:
-    """The plan after another pass of the preview control, which has less error of the ZMP.
+    """Return the plan after another pass of the preview control, with less error of the ZMP.
 
-    Feet and ZMP reference stay as they are. Center of mass, pelvis and legs move otherwise.
+    Feet and ZMP reference stay as they are. Center of mass, pelvis and legs move differently.
 
     Args:
-        plan: A walk.
-        biped: The robot as it is assumed.
+        plan: Plan of a walk.
+        biped: The assumed robot.
         control_period_s: Time between rows [s].
 
     Raises:
@@ -213,12 +215,12 @@ def refine_plan(plan: WalkPlan, biped: Biped, control_period_s: float) -> WalkPl
         com_height_m=plan.com_height, period_s=control_period_s, gravity=plan.gravity
     )
     further = follow_zmp(preview, plan.zmp - plan.zmp_of_motion, np.zeros(2))
-    # that of this robot, which may carry more than the one that the plan was made for
+    # this robot may carry more than the one of the plan
     from_pelvis = turn(biped.chains.center_of_mass(plan.q), plan.heading)
     com = (plan.pelvis + from_pelvis)[:, :2] + further.com
-    feet = _Feet(plan.ankles, plan.foot_yaw, plan.heading)
+    feet = Feet(plan.ankles, plan.foot_yaw, plan.heading)
     pelvis = _pelvis_under(com, plan.pelvis, biped, feet, plan.timing.time)
-    q = _angles(biped, pelvis, feet, plan.timing.time)
+    q = _joint_angles(biped, pelvis, feet, plan.timing.time)
     q_dot, q_ddot = derivatives(q, control_period_s)
     moved = replace(
         plan,
@@ -233,25 +235,25 @@ def refine_plan(plan: WalkPlan, biped: Biped, control_period_s: float) -> WalkPl
 
 
 def with_torque(plan: WalkPlan, biped: Biped, control_period_s: float) -> WalkPlan:
-    """The same motion with the torques and the ZMP that it has on another robot of that size."""
-    dynamics = _dynamics(biped, plan.pelvis, plan.heading, plan.q, control_period_s)
-    feet = _Feet(plan.ankles, plan.foot_yaw, plan.heading)
-    torque = _joint_torque(biped, feet, plan.q, dynamics, plan.share)
+    """Return the same motion with the torques and the ZMP of another robot of the same size."""
+    dynamics = walk_dynamics(biped, plan.pelvis, plan.heading, plan.q, control_period_s)
+    feet = Feet(plan.ankles, plan.foot_yaw, plan.heading)
+    torque = walk_torque(biped, feet, plan.q, dynamics, plan.share)
     return replace(plan, torque=torque, zmp_of_motion=dynamics.zmp)
 
 
 def require_feasible(plan: WalkPlan, biped: Biped, servos: tuple[Servo, ...]) -> None:
-    """A plan that the robot cannot follow is an error now, not a fall later.
+    """Refuse a plan that the robot cannot follow: an error now, instead of a fall later.
 
     Raises:
-        ConfigurationError: A joint leaves its range or needs more speed or torque than its servo
+        ConfigurationError: A joint leaves its range, or needs more speed or torque than its servo
             has.
     """
     joints = [biped.rigid.joint(name) for name in biped.joint_names]
     low, high = np.array([joint.range for joint in joints]).T
     speed = np.array([servo.speed_limit for servo in servos])
     torque = np.array([servo.torque_limit for servo in servos])
-    for needed, allowed, sign, what, unit in (
+    for needed, allowed, sign, limit, unit in (
         (-plan.q, -low, -1.0, "an angle of at least", "rad"),
         (plan.q, high, 1.0, "an angle of at most", "rad"),
         (np.abs(plan.q_dot), speed, 1.0, "a speed of at most", "rad/s"),
@@ -262,61 +264,43 @@ def require_feasible(plan: WalkPlan, biped: Biped, servos: tuple[Servo, ...]) ->
         if excess[row, joint] > 0.0:
             raise ConfigurationError(
                 f"the walk asks too much of joint {biped.joint_names[joint]!r} at"
-                f" {plan.timing.time[row]:.3f} s: it allows {what} {sign * allowed[joint]:.3f}"
+                f" {plan.timing.time[row]:.3f} s: it allows {limit} {sign * allowed[joint]:.3f}"
                 f" {unit}, the plan needs {sign * needed[row, joint]:.3f} {unit}; use longer"
                 " durations, a lower lift or another hip height"
             )
 
 
-def derivatives(samples: Array, period_s: float) -> tuple[Array, Array]:
-    """First and second derivative by central differences, time first; zero at the ends."""
-    first = np.zeros_like(samples)
-    second = np.zeros_like(samples)
-    first[1:-1] = (samples[2:] - samples[:-2]) / (2.0 * period_s)
-    second[1:-1] = (samples[2:] - 2.0 * samples[1:-1] + samples[:-2]) / period_s**2
-    return first, second
-
-
 def swing_height(progress: Array) -> Array:
-    """Height of the swing foot over its lift, 64 s³ (1 − s)³: it starts and ends at rest."""
+    """Return the height of the swing foot over its lift, 64 s³ (1 − s)³, at rest at both ends."""
     return 64.0 * (progress * (1.0 - progress)) ** 3
 
 
-@dataclass(frozen=True)
-class _Feet:
-    """Ankles (T, 2, 3) [m], headings of the feet (T, 2) and of the pelvis (T,) [rad]."""
-
-    ankles: Array
-    yaw: Array
-    heading: Array
-
-
-def _foot_paths(gait: Gait, timing: Timing, holds: Footholds, biped: Biped) -> _Feet:
-    positions, yaw = holds.swinging(timing)
+def _foot_paths(gait: Gait, timing: Timing, holds: Footholds, biped: Biped) -> Feet:
+    positions, yaw = holds.paths(timing)
     ankles = np.empty((len(timing.time), 2, 3))
     ankles[..., :2] = positions
     ankles[..., 2] = biped.ankle_height
     rows = np.arange(len(timing.time))
     ankles[rows, RIGHT - timing.support, 2] += gait.lift_m * swing_height(timing.swing)
-    return _Feet(ankles, yaw, yaw.mean(axis=1))
+    return Feet(ankles, yaw, yaw.mean(axis=1))
 
 
-def _standing(gait: Gait, biped: Biped, zmp: Array, feet: _Feet) -> tuple[Array, float]:
-    """Pelvis over the ZMP at rest, and the height of the center of mass."""
+def _standing_pelvis(gait: Gait, biped: Biped, zmp: Array, feet: Feet) -> tuple[Array, float]:
+    """Return the pelvis over the ZMP at rest, and the height of the center of mass."""
     start = np.array([[*zmp, gait.hip_height_m]])
     begin = np.zeros(1)
     pelvis = _pelvis_under(zmp[None], start, biped, feet, begin)
-    q = _angles(biped, pelvis, feet, begin)
+    q = _joint_angles(biped, pelvis, feet, begin)
     com = pelvis + turn(biped.chains.center_of_mass(q), feet.heading)
     return pelvis[0], float(com[0, 2])
 
 
-def _pelvis_under(com: Array, start: Array, biped: Biped, feet: _Feet, t: Array) -> Array:
-    """Pelvis of one height that puts the center of mass where it belongs."""
+def _pelvis_under(com: Array, start: Array, biped: Biped, feet: Feet, t: Array) -> Array:
+    """Find the pelvis of one height that brings the center of mass to its reference."""
     pelvis = np.array(start)
     error = np.full(1, np.inf)
     for _ in range(_MAX_ITERATIONS):
-        q = _angles(biped, pelvis, feet, t)
+        q = _joint_angles(biped, pelvis, feet, t)
         from_pelvis = turn(biped.chains.center_of_mass(q)[:, :2], feet.heading)
         error = pelvis[:, :2] + from_pelvis - com
         pelvis[:, :2] -= error
@@ -328,7 +312,7 @@ def _pelvis_under(com: Array, start: Array, biped: Biped, feet: _Feet, t: Array)
     )
 
 
-def _angles(biped: Biped, pelvis: Array, feet: _Feet, time: Array) -> Array:
+def _joint_angles(biped: Biped, pelvis: Array, feet: Feet, time: Array) -> Array:
     try:
         return biped.joint_angles(pelvis, feet.ankles, feet.heading, feet.yaw)
     except ElasticError:
@@ -339,67 +323,17 @@ def _angles(biped: Biped, pelvis: Array, feet: _Feet, time: Array) -> Array:
         row, leg = np.unravel_index(int(np.argmax(distance)), distance.shape)
         x, y, z = from_hip[row, leg]
         vertical = "lift_m" if z > 0.0 else "hip_height_m"
-        # what would bring the foot into reach if its part of the distance were gone
-        left = {
+        # distance without the part of each parameter: below the reach, the parameter can cure it
+        other_parts = {
             vertical: np.hypot(x, y),
             "hip_half_spacing": np.hypot(x, z),
             "step_length_m": np.hypot(y, z),
         }
-        helps = [name for name, rest in left.items() if rest < reach]
+        cures = [name for name, rest in other_parts.items() if rest < reach]
         excess = max(float(distance[row, leg]) - reach, np.finfo(np.float64).eps)
         decimals = max(4, -int(np.floor(np.log10(excess))))
         raise ConfigurationError(
             f"the {('left', 'right')[leg]} foot is out of reach at {time[row]:.3f} s:"
             f" {distance[row, leg]:.{decimals}f} m from the hip to the ankle, at most {reach:g} m;"
-            f" lower {' or '.join(helps or [vertical])}"
+            f" lower {' or '.join(cures or [vertical])}"
         ) from None
-
-
-@dataclass(frozen=True)
-class _Dynamics:
-    """Force of the ground, its ZMP and vertical moment; torque of the joints, (T, ...) each."""
-
-    force: Array
-    zmp: Array
-    moment: Array
-    torque: Array
-
-
-def _dynamics(biped: Biped, pelvis: Array, heading: Array, q: Array, period_s: float) -> _Dynamics:
-    """Inverse dynamics of the whole body; the force is in the world."""
-    # Pinocchio takes a tenth of the start of a robot that does not walk
-    from elastic_env.rigid.floating_body import FloatingBody
-
-    body = FloatingBody(biped.rigid, biped.joint_names)
-    q_dot, q_ddot = derivatives(q, period_s)
-    moved = derivatives(pelvis, period_s)
-    turned = derivatives(heading, period_s)
-    base_dot, base_ddot = (
-        np.concatenate([turn(linear, -heading), angular[:, None]], axis=1)
-        for linear, angular in zip(moved, turned, strict=True)
-    )
-    wrench, torque = body.inverse_dynamics(q, base_dot, q_dot, base_ddot, q_ddot)
-    force = turn(wrench[:, :3], heading)
-    moment = turn(wrench[:, 3:], heading)
-    # the moment of the ground's force about the pelvis has no horizontal part about the ZMP
-    height = -pelvis[:, 2]
-    x = (-moment[:, 1] + height * force[:, 0]) / force[:, 2]
-    y = (moment[:, 0] + height * force[:, 1]) / force[:, 2]
-    about_zmp = moment[:, 2] - (x * force[:, 1] - y * force[:, 0])
-    zmp = np.stack([x, y], axis=-1) + pelvis[:, :2]
-    return _Dynamics(force, zmp, about_zmp, torque)
-
-
-def _joint_torque(biped: Biped, feet: _Feet, q: Array, dynamics: _Dynamics, share: Array) -> Array:
-    """Joint torques, the ground's force shared between the feet, (T, 12) [N·m]."""
-    weights = shares(share)
-    points = np.zeros((len(q), 2, 3))
-    points[..., :2] = contact_points(dynamics.zmp, share, feet.ankles[..., :2])
-    forces = weights[..., None] * dynamics.force[:, None]
-    moments = np.zeros_like(forces)
-    moments[..., 2] = weights * dynamics.moment[:, None]
-    arms = points - feet.ankles
-    moments += np.cross(arms, forces)
-    in_feet = (turn(forces, -feet.yaw), turn(moments, -feet.yaw))
-    contact = biped.chains.loads(len(q), wrench=in_feet)
-    return dynamics.torque + biped.chains.torque(contact, q)
