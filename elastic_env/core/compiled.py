@@ -100,8 +100,7 @@ def record_type(**fields: Any) -> np.dtype[Any]:
     Args:
         **fields: Shape of each field of numbers, () for a number.
     """
-    parts = [(name, np.float64, shape) for name, shape in fields.items()]
-    return np.dtype((np.record, parts))
+    return np.dtype((np.record, [(name, np.float64, shape) for name, shape in fields.items()]))
 
 
 def within_compiled(function: Callable[_P, _R]) -> Callable[_P, _R]:

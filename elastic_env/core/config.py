@@ -74,8 +74,7 @@ def _strict_schema(schema: Any) -> Any:
         strict["strict"] = True
     if kind not in ("float", "int", "list", "tuple"):
         return strict
-    convert = _to_whole if kind == "int" else plain_numbers
-    return no_info_before_validator_function(convert, strict)
+    return no_info_before_validator_function(_to_whole if kind == "int" else plain_numbers, strict)
 
 
 def _to_whole(value: Any) -> Any:
@@ -102,8 +101,7 @@ class Model(BaseModel):
         try:
             super().__init__(**values)
         except ValidationError as error:
-            problems = problems_of(type(self), error, values)
-            raise ModelError(type(self).__name__, problems) from None
+            raise ModelError(type(self).__name__, problems_of(type(self), error, values)) from None
 
     def _check(self) -> None:
         """Refuse parameters that contradict each other, by a ValueError."""
@@ -120,8 +118,7 @@ class Model(BaseModel):
         for field in cls.model_fields.values():
             if field.description is not None:
                 parts = re.split(r"\n\s*\n", field.description)
-                lines = [" ".join(part.split()) for part in parts]
-                field.description = "\n\n".join(lines)
+                field.description = "\n\n".join([" ".join(part.split()) for part in parts])
 
     @classmethod
     def __get_pydantic_core_schema__(cls, source: Any, handler: Any) -> CoreSchema:
@@ -237,8 +234,7 @@ def load_json(
     """
     content = read_json(path, _BYTES_PER_CHARACTER * LARGEST_JSON, missing, within)
     if not isinstance(content, dict):
-        kind = type(content).__name__
-        raise ConfigurationError(f"{shorten(path)} must be a mapping, got {kind}")
+        raise ConfigurationError(f"{shorten(path)} must be a mapping, got {type(content).__name__}")
     try:
         return model(**content)
     except ModelError as error:

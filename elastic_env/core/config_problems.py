@@ -123,8 +123,7 @@ def _problem(model: type[BaseModel], path: ParameterPath, problem: Any) -> Probl
     field = model.model_fields.get(str(path[0])) if len(path) == 1 else None
     match problem["type"]:
         case "extra_forbidden":
-            choices = choices_listed(path[-1], model.model_fields)
-            return Problem(path, "unknown", choices)
+            return Problem(path, "unknown", choices_listed(path[-1], model.model_fields))
         case "missing" if isinstance(path[-1], int):  # of a list of a fixed length
             return Problem(path[:-1], "must", f"must have an entry {path[-1] + 1}, got {given}")
         case "missing":

@@ -92,8 +92,7 @@ def _parse(file: Path, text: str, row: str, most_rows: int, example: str) -> Tab
         has = f"more than {most_rows}" if count else "0"
         needed = f"1 to {most_rows} {row}s, a line each"
         raise ConfigurationError(f"{shorten(file)} must have {needed}, it has {has}")
-    rows = np.array(values, dtype=np.float64)
-    return Table(names, rows.reshape(count, len(names)))
+    return Table(names, np.array(values, dtype=np.float64).reshape(count, len(names)))
 
 
 def _names(file: Path, header: list[str]) -> tuple[str, ...]:
@@ -141,8 +140,7 @@ def _numbers(file: str, where: str, names: tuple[str, ...], cells: list[str]) ->
 
 def _separator(cells: list[str]) -> str:
     """Return the name of another separator than commas; empty where there is none."""
-    text = "".join(cells)
-    return next((name for mark, name in _SEPARATORS.items() if mark in text), "")
+    return next((name for mark, name in _SEPARATORS.items() if mark in "".join(cells)), "")
 
 
 def _number(cell: str) -> float:

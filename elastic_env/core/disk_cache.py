@@ -62,8 +62,7 @@ class DiskCache:
             return None
         most = hashlib.sha256().digest_size + length * _NUMBER.itemsize
         try:
-            content = read_bounded(file, most)
-            numbers = _unseal(key, content)
+            numbers = _unseal(key, read_bounded(file, most))
         except FileNotFoundError:
             return None
         except (OSError, ConfigurationError) as error:

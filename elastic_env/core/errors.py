@@ -29,8 +29,7 @@ class ElasticError(ValueError):
     exit_code: ClassVar[int] = 2
 
     def __init__(self, *args: Any) -> None:
-        parts = [readable(arg) if isinstance(arg, str) else arg for arg in args]
-        super().__init__(*parts)
+        super().__init__(*[readable(arg) if isinstance(arg, str) else arg for arg in args])
 
 
 class SystemFailedError(ElasticError):

@@ -52,8 +52,7 @@ class _Loader(Composer, yaml.CSafeLoader):
         if isinstance(event, yaml.AliasEvent):
             node = super().compose_node(parent, index)
             if id(node) not in self._sizes:
-                problem = f"the alias *{event.anchor} stands within what it names"
-                raise _refusal(event, problem)
+                raise _refusal(event, f"the alias *{event.anchor} stands within what it names")
             return node
         _require_plain(event)
         self._depth += 1
@@ -141,8 +140,7 @@ class _Dumper(yaml.SafeDumper):
 
     def represent_text(self, text: str) -> yaml.ScalarNode:
         """Represent text, with escapes where it holds line ends or others that do not print."""
-        style = None if text.isprintable() else '"'
-        return self.represent_scalar(f"{_TAG}str", text, style)
+        return self.represent_scalar(f"{_TAG}str", text, None if text.isprintable() else '"')
 
 
 _Dumper.add_representer(str, _Dumper.represent_text)
@@ -176,8 +174,7 @@ def _require_plain(event: Any) -> None:
         tag = event.tag.replace(_TAG, "!!")[:100]
         raise _refusal(event, f"the tag {tag!r} has no meaning here; leave it out")
     if isinstance(event, yaml.ScalarEvent) and NO_TEXT.search(event.value):
-        problem = "text must hold neither zero bytes nor halves of characters"
-        raise _refusal(event, problem)
+        raise _refusal(event, "text must hold neither zero bytes nor halves of characters")
 
 
 def _require_names(loader: _Loader, node: yaml.MappingNode) -> None:
@@ -190,8 +187,7 @@ def _require_names(loader: _Loader, node: yaml.MappingNode) -> None:
             is_scalar = isinstance(key, yaml.ScalarNode)
             got = repr(loader.construct_object(key)) if is_scalar else f"a {key.id}"
             cure = "put it in quotes if it is meant"
-            problem = f"the name of a parameter must be text, got {got}; {cure}"
-            raise _refusal(key, problem)
+            raise _refusal(key, f"the name of a parameter must be text, got {got}; {cure}")
         if key.value in seen:
             twice = f"the key {key.value[:100]!r} stands twice in one mapping"
             raise _refusal(key, f"{twice}; keep one of them")
@@ -207,5 +203,4 @@ def _parts(node: yaml.Node | None) -> list[yaml.Node]:
 
 def _refusal(at: Any, problem: str) -> yaml.MarkedYAMLError:
     """Return an error at a place: a node, an event or a mark."""
-    mark = getattr(at, "start_mark", at)
-    return yaml.MarkedYAMLError(problem=problem, problem_mark=mark)
+    return yaml.MarkedYAMLError(problem=problem, problem_mark=getattr(at, "start_mark", at))

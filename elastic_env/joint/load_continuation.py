@@ -176,8 +176,7 @@ class _Springs:
 
     def softest(self, q: Array, load: Array) -> IntArray:
         """Return the joint that moves most in the direction of least stiffness, (...)."""
-        rows = np.ones_like(load, dtype=np.bool_)
-        matrix = self._matrix(q, load * self.compliance, rows)
+        matrix = self._matrix(q, load * self.compliance, np.ones_like(load, dtype=np.bool_))
         values, vectors = np.linalg.eig(matrix)
         least = np.real(values).argmin(axis=-1)[..., None, None]
         softest = np.take_along_axis(vectors, least, axis=-1)[..., 0]

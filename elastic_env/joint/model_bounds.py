@@ -161,8 +161,7 @@ class _Counts:
     def _attach(self, element: ET.Element, files: Files, copies: float, depth: int) -> None:
         root = self._attached.get(element.get("model", ""))
         if root is not None:
-            name = element.get("body")
-            bodies = [body for body in root.iter("body") if body.get("name") == name]
+            bodies = [body for body in root.iter("body") if body.get("name") == element.get("body")]
             for body in bodies or root.findall("worldbody"):
                 self._count(body, files, copies, in_world=True, depth=depth + 1)
 
@@ -219,8 +218,7 @@ class _Counts:
                     f"{name} of <{tag}> in {self.model.name} must be numbers, got {quote(value)}"
                 )
         if tag == "texture" and {"width", "height"} <= set(values):
-            sizes = [*_numbers(values["width"]), *_numbers(values["height"])]
-            self.pixels += _product(sizes)
+            self.pixels += _product([*_numbers(values["width"]), *_numbers(values["height"])])
             self._require_at_most("pixels of pictures", self.pixels, MOST_PIXELS)
         if tag == "mesh" and "params" in values:
             resolution = max(_numbers(values["params"]), default=0.0)

@@ -118,8 +118,7 @@ def _read_urdf(text: ModelText, shapes: bool) -> ReadModel:
 def _mjcf_spec(text: ModelText) -> MjSpec:
     """Read MJCF into a specification. MuJoCo gets a file that is not in UTF-8 as a text."""
     if text.file is not None and text.is_utf8:
-        file = str(text.file)
-        return call_mujoco(lambda: MjSpec.from_file(file), text.name, "read")
+        return call_mujoco(lambda: MjSpec.from_file(str(text.file)), text.name, "read")
     spec = call_mujoco(lambda: MjSpec.from_string(text.text), text.name, "read")
     if text.file is not None:
         spec.modelfiledir = str(text.folder)
@@ -172,15 +171,13 @@ def _whole_copy(spec: MjSpec, name: str) -> MjSpec:
     for kind in _REFERRING.split():
         if len(getattr(whole, kind)) < len(getattr(spec, kind)):
             call_mujoco(spec.compile, name, "compile")  # its error names the reference
-            problem = f"one of the {kind} of {name} cannot be copied by MuJoCo"
-            raise ConfigurationError(problem)
+            raise ConfigurationError(f"one of the {kind} of {name} cannot be copied by MuJoCo")
     return whole
 
 
 def _bodies_with_mesh_mass(spec: MjSpec) -> list[mujoco.MjsBody]:
     """Return the bodies whose mass comes from a mesh."""
-    rule = spec.compiler.inertiafromgeom
-    from_geoms = rule == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
+    from_geoms = spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
     bodies = [body for body in spec.bodies[1:] if from_geoms or not body.explicitinertial]
     return [body for body in bodies if any(map(_uses_mesh, body.geoms))]
 

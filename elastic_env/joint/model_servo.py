@@ -94,8 +94,7 @@ def force_limit(model: MjModel, joint: str) -> float | None:
     limits = [(1.0, model.jnt_actfrclimited[number], model.jnt_actfrcrange[number])]
     for i in _actuators(model, joint):
         gear = abs(float(model.actuator_gear[i, 0]))
-        force = (model.actuator_forcelimited[i], model.actuator_forcerange[i])
-        limits.append((gear, *force))
+        limits.append((gear, model.actuator_forcelimited[i], model.actuator_forcerange[i]))
         is_fixed = model.actuator_gaintype[i] == mujoco.mjtGain.mjGAIN_FIXED
         is_unbiased = model.actuator_biastype[i] == mujoco.mjtBias.mjBIAS_NONE
         if is_fixed and is_unbiased and model.actuator_dyntype[i] == 0:

@@ -122,8 +122,7 @@ def _without_constraints(model: mujoco.MjModel) -> mujoco.MjModel:
     linear.opt.disableflags |= int(np.bitwise_or.reduce(_LEFT_OUT))
     linear.dof_frictionloss[:] = 0.0
     linear.tendon_frictionloss[:] = 0.0
-    middle = linear.tendon_lengthspring.mean(axis=1, keepdims=True)
-    linear.tendon_lengthspring[:] = middle
+    linear.tendon_lengthspring[:] = linear.tendon_lengthspring.mean(axis=1, keepdims=True)
     return linear
 
 

@@ -76,8 +76,7 @@ class Workspace:
         extent = self.highest - self.lowest
         width = np.where(np.isfinite(extent), _MARGIN * extent, _MARGIN)
         low = np.maximum(self.lowest + width, self.home - within_rad)
-        high = np.minimum(self.highest - width, self.home + within_rad)
-        return low, high
+        return low, np.minimum(self.highest - width, self.home + within_rad)
 
     def poses(self, generator: np.random.Generator, count: int, within_rad: float) -> Array:
         """Draw poses that the servos hold, evenly over the joint angles, (count, n) [rad].
@@ -98,7 +97,7 @@ class Workspace:
         )
 
     def held_home(self) -> Array | None:
-        """Find a pose at home or near it that the servos hold, (n,) [rad]; None if none is found."""
+        """Find a pose at or near home that the servos hold, (n,) [rad]; None if none is found."""
         generator = np.random.default_rng(0)
         low, high = self.pose_bounds()
         stride = _SEARCH_STRIDE * np.maximum(high - low, 0.0)
@@ -166,8 +165,7 @@ class Poses(_RandomPoses):
         since = t - STAND_S - period * number
         settled = self.move_s + self.settle_s
         is_at_rest = (since > settled + 1e-9) & (since <= period + 1e-9)
-        rest = np.where(is_at_rest, number, -1)
-        return Plan(*self._motion(visits, t, period), is_at_rest, rest)
+        return Plan(*self._motion(visits, t, period), is_at_rest, np.where(is_at_rest, number, -1))
 
 
 class Moves(_RandomPoses):

@@ -71,8 +71,7 @@ class Gait(Model):
     @property
     def step_period_s(self) -> float:
         """Duration of a step [s]."""
-        swing_s = self.double_support_s + self.single_support_s
-        return swing_s + self.last_double_support_s
+        return self.double_support_s + self.single_support_s + self.last_double_support_s
 
     @property
     def duration_s(self) -> float:
@@ -233,8 +232,7 @@ def footholds(gait: Gait, feet: Array) -> Footholds:
     """
     beside = np.array(feet)
     if gait.step_width_m is not None:
-        widths = np.array([0.5, -0.5]) * gait.step_width_m
-        beside[:, 1] = feet[:, 1].mean() + widths
+        beside[:, 1] = feet[:, 1].mean() + np.array([0.5, -0.5]) * gait.step_width_m
     # a pair of feet for each step, closed by the last one; a step sets one foot of a pair
     turns = gait.turn_rad * np.arange(gait.num_steps)
     yaw = np.append(turns, turns[-1])
@@ -266,8 +264,7 @@ def zmp_reference(gait: Gait, timing: Timing, feet: Footholds) -> Array:
     zmp = np.repeat(feet.positions[:1].mean(axis=1), len(timing.time), axis=0)
     for begin, duration, start, target in _shifts(gait, feet):
         progress = (timing.time - begin) / duration
-        is_smooth = gait.transfer == "smooth"
-        blend = minimum_jerk(progress) if is_smooth else np.clip(progress, 0.0, 1.0)
+        blend = minimum_jerk(progress) if gait.transfer == "smooth" else np.clip(progress, 0.0, 1.0)
         zmp += blend[:, None] * (target - start)
     return zmp
 
@@ -288,8 +285,7 @@ def _shifts(gait: Gait, feet: Footholds) -> list[_Shift]:
     """Return the moves of the ZMP: begin [s], duration [s], from and to [m]."""
     shifts: list[_Shift] = []
     middles = feet.positions.mean(axis=1)
-    offsets = inward_offsets(gait, feet.positions[0])
-    supports = feet.positions + turn(offsets, feet.yaw)
+    supports = feet.positions + turn(inward_offsets(gait, feet.positions[0]), feet.yaw)
     last = middles[0]
     begin = STAND_S
     for step in range(gait.num_steps):

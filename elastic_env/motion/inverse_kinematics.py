@@ -60,8 +60,7 @@ def _solve_pose(tool: EndEffector, q: Array, place: Array, R_ref: Array) -> Arra
         position, R = tool.pose(q)
         error = place - position
         if keeps_orientation:
-            turn = Rotation.from_matrix(R_ref @ R.T).as_rotvec()
-            error = np.concatenate([error, turn])
+            error = np.concatenate([error, Rotation.from_matrix(R_ref @ R.T).as_rotvec()])
         if np.abs(error).max() < _TOLERANCE:
             return q
         J_position, J_rotation = tool.jacobian(q)

@@ -251,8 +251,7 @@ class Multisine(_Oscillation):
 
     @property
     def _omega(self) -> Array:
-        hertz = np.linspace(self.lowest_hz, self.highest_hz, self.components)
-        return 2.0 * np.pi * hertz
+        return 2.0 * np.pi * np.linspace(self.lowest_hz, self.highest_hz, self.components)
 
     @override
     def extent(self) -> Extent:

@@ -30,7 +30,7 @@ from elastic_env.motion.foot_clearance import require_clear_feet
 from elastic_env.motion.gait import RIGHT, Footholds, Gait, Timing
 from elastic_env.motion.preview_control import PreviewConfig, follow_zmp
 from elastic_env.motion.trajectory import derivatives
-from elastic_env.motion.walk_dynamics import Feet, walk_torque, walk_dynamics
+from elastic_env.motion.walk_dynamics import Feet, walk_dynamics, walk_torque
 from elastic_env.rigid.biped import Biped
 from elastic_env.rigid.contact_force import load_share
 from elastic_env.rigid.leg_kinematics import turn

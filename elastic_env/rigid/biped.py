@@ -77,8 +77,7 @@ class Biped:
     @property
     def ankles(self) -> Array:
         """Ankles with the feet flat on their footholds, left first, (2, 3) [m]."""
-        heights = np.full((2, 1), self.ankle_height)
-        return np.hstack([self.footholds, heights])
+        return np.hstack([self.footholds, np.full((2, 1), self.ankle_height)])
 
     def joint_angles(
         self, pelvis: Array, ankles: Array, heading: Array | float = 0.0, foot_yaw: Any = 0.0

@@ -54,8 +54,7 @@ class EndEffector:
         position, _, axes, anchors = self._chain_poses(q)
         moved, turned = np.zeros((2, len(position), 3, self._n))
         columns = self._chain["column"][:-1]
-        levers = position[:, None] - anchors
-        moved[:, :, columns] = np.cross(axes, levers).swapaxes(1, 2)
+        moved[:, :, columns] = np.cross(axes, position[:, None] - anchors).swapaxes(1, 2)
         turned[:, :, columns] = axes.swapaxes(1, 2)
         shape = (*q.shape[:-1], 3, self._n)
         return moved.reshape(shape), turned.reshape(shape)

@@ -67,8 +67,7 @@ class Tree:
     def add_load(self, body: int, mass: float, place: Array) -> Any:
         """Return the links with a further point mass [kg] at a place in a body [m]."""
         links = self.links.copy()
-        carrier = self.carrier[body]
-        _add_mass(links[carrier], mass, self.place[body] + self.R[body] @ place)
+        _add_mass(links[self.carrier[body]], mass, self.place[body] + self.R[body] @ place)
         return links
 
 
