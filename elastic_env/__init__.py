@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import gymnasium
 
-from elastic_env.core.installed import own_package
+from elastic_env.core.installed import import_package
 from elastic_env.rendering.headless import prefer_egl
 
 if TYPE_CHECKING:
@@ -63,7 +63,7 @@ _PACKAGES = ("baselines", "train")
 def __getattr__(name: str) -> Any:
     """Import a public name at its first use: helper processes of a control loop must start fast."""
     if name in _PACKAGES:
-        return own_package(name)
+        return import_package(name)
     if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(import_module(_MODULES[name]), name)

@@ -88,7 +88,6 @@ class Robot:
                 " processor"
             )
         task = self.task(self._configuration(arguments), num_envs)
-        picture = partial(self.picture, task)
         simulation = None
         if backend == "warp":
             from elastic_env.world.warp_physics import WarpWorlds  # of the extra `gpu`
@@ -100,7 +99,7 @@ class Robot:
             autoreset_mode,
             simulation=simulation,
             render_mode=render_mode,
-            picture=picture,
+            picture=partial(self.picture, task),
         )
 
     def register(self) -> None:

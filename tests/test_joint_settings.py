@@ -169,7 +169,7 @@ def test_rigid_joints_are_said_by_word_or_number(rigid: str, tmp_path: Path) -> 
         ({"*": {"stiffness": 400, "servo": {"kp": 3}}}, "joint 'j1':.*kp"),
         (
             {"*": {"stiffness": 400, "servo": {"integral_gain": 0}}},
-            "servo of joint 'j1' gives way.*say its position",
+            "servo of joint 'j1' gives way.*give its position",
         ),
         ({"*": {"stiffness": "soft"}}, "joint 'j1':.*stiffness"),
         (
@@ -322,7 +322,7 @@ def test_a_force_range_that_pushes_one_way_is_refused_by_name() -> None:
         "</mujoco>", '<actuator><motor joint="j1" ctrlrange="0 20"/></actuator></mujoco>'
     )
     with pytest.raises(
-        ConfigurationError, match=r"force range of joint 'j1' is 0 to 20.*say its torque_limit"
+        ConfigurationError, match=r"force range of joint 'j1' is 0 to 20.*give its torque_limit"
     ):
         configure_robot(model, {"j*": 400})
     given = configure_robot(model, {"j*": {"stiffness": 400, "servo": {"torque_limit": 20}}})

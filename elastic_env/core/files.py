@@ -76,8 +76,8 @@ def _require_plain(path: Path, status: os.stat_result, most_bytes: int) -> None:
         raise _too_large(path, most_bytes, str(status.st_size))
 
 
-def _too_large(path: Path, most_bytes: int, has: str) -> ConfigurationError:
-    problem = f"must have at most {most_bytes} bytes, it has {has}"
+def _too_large(path: Path, most_bytes: int, size: str) -> ConfigurationError:
+    problem = f"must have at most {most_bytes} bytes, it has {size}"
     return ConfigurationError(f"{_short_path(path)} {problem}")
 
 

@@ -40,7 +40,7 @@ def _packages_of(extra: str) -> list[str]:
     return [f"'{name.strip()}'" for name, _, marker in parts if of_extra.search(marker)]
 
 
-def own_package(name: str) -> ModuleType:
+def import_package(name: str) -> ModuleType:
     """Import another package of this project, after a check that no other file has its name.
 
     Args:

@@ -140,9 +140,8 @@ class SignalTable:
             error.add_note("an environment's argument `sensors` adds signals to an observation")
             raise error
         if indices != list(range(indices[0], indices[-1] + 1)):
-            raise ConfigurationError(
-                f"the columns of {name!r} must be neighbours, they are {indices}"
-            )
+            problem = f"the columns of {name!r} must be neighbours, they are {indices}"
+            raise ConfigurationError(problem)
         return slice(indices[0], indices[-1] + 1)
 
     def space(self, dtype: type[np.float32] | type[np.float64]) -> Any:

@@ -57,8 +57,8 @@ class _Loader(Composer, yaml.CSafeLoader):
         _require_plain(event)
         self._depth += 1
         if self._depth > DEEPEST_NESTING:
-            bound = f"at most {DEEPEST_NESTING} deep"
-            raise _refusal(event, f"mappings and lists must be nested {bound}")
+            problem = f"mappings and lists must be nested at most {DEEPEST_NESTING} deep"
+            raise _refusal(event, problem)
         node = super().compose_node(parent, index)
         self._depth -= 1
         if isinstance(node, yaml.MappingNode):
@@ -66,8 +66,9 @@ class _Loader(Composer, yaml.CSafeLoader):
         size = 1 + sum(self._sizes[id(part)] for part in _parts(node))
         self._sizes[id(node)] = size
         if size > MOST_VALUES:
-            bound = f"at most {MOST_VALUES} values"
-            raise _refusal(event, f"it must hold {bound}, aliases counted in full")
+            raise _refusal(
+                event, f"it must hold at most {MOST_VALUES} values, aliases counted in full"
+            )
         return node
 
     def construct_number(self, node: Any) -> int | float:
@@ -81,8 +82,8 @@ class _Loader(Composer, yaml.CSafeLoader):
                 return self.construct_yaml_int(node)
             return self.construct_yaml_float(node)
         except ValueError:
-            cure = "put text that looks like one in quotes"
-            raise _refusal(node, f"{text!r} is no number; {cure}") from None
+            problem = f"{text!r} is no number; put text that looks like one in quotes"
+            raise _refusal(node, problem) from None
 
 
 _Loader.add_implicit_resolver(f"{_TAG}float", _EXPONENT, list("-+.0123456789"))
@@ -98,8 +99,7 @@ def parse_yaml(text: str) -> Any:
             dates as objects, zero bytes, or a key twice.
     """
     if len(text) > LARGEST_TEXT:
-        bound = f"at most {LARGEST_TEXT} characters"
-        raise yaml.YAMLError(f"it must have {bound}, got {len(text)}")
+        raise yaml.YAMLError(f"it must have at most {LARGEST_TEXT} characters, got {len(text)}")
     loader = _Loader(text)
     try:
         return loader.get_single_data()
@@ -186,11 +186,11 @@ def _require_names(loader: _Loader, node: yaml.MappingNode) -> None:
         if key.tag not in (f"{_TAG}str", f"{_TAG}value"):
             is_scalar = isinstance(key, yaml.ScalarNode)
             got = repr(loader.construct_object(key)) if is_scalar else f"a {key.id}"
-            cure = "put it in quotes if it is meant"
-            raise _refusal(key, f"the name of a parameter must be text, got {got}; {cure}")
+            problem = f"the name of a parameter must be text, got {got}"
+            raise _refusal(key, f"{problem}; put it in quotes if it is meant")
         if key.value in seen:
-            twice = f"the key {key.value[:100]!r} stands twice in one mapping"
-            raise _refusal(key, f"{twice}; keep one of them")
+            problem = f"the key {key.value[:100]!r} stands twice in one mapping"
+            raise _refusal(key, f"{problem}; keep one of them")
         seen.add(key.value)
 
 

@@ -46,9 +46,9 @@ def drive_joint(
     if servo is not None and (rule == "replace" or not existing):
         _add_servo(spec, servo_name(name), driven, servo)
     elif servo is not None:
-        kept = ", ".join(repr(actuator.name) for actuator in existing)
+        names = ", ".join(repr(actuator.name) for actuator in existing)
         warnings.warn(
-            f"the hinge {name!r} keeps its actuator {kept}, so that its servo is left out; choose"
+            f"the hinge {name!r} keeps its actuator {names}, so that its servo is left out; choose"
             " actuators='replace' for the servo in its place, or give the joint servo=None",
             stacklevel=4,
         )

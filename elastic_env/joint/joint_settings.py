@@ -97,7 +97,7 @@ class ServoSettings(Model):
         if self.position_gain is None:
             raise ConfigurationError(
                 f"the servo of joint {joint!r} gives way under a load, as its integral_gain is 0;"
-                " say its position_gain [N·m/rad] beside it"
+                " give its position_gain [N·m/rad], too"
             )
         return self.position_gain
 

@@ -73,8 +73,8 @@ class LoadPath:
                 f"{question} At {100.0 * float(self.load[row][0]):.3g} % of the load K + ∂τ_g/∂q"
                 f" becomes singular: the link tips over, and {rest}"
             )
-        here = f"at {self.q[(*row, joint)]:.4g} rad"
-        return f"{question} The pose is bistable: the link can rest {' and '.join([here, *others])}"
+        poses = " and ".join([f"at {self.q[(*row, joint)]:.4g} rad", *others])
+        return f"{question} The pose is bistable: the link can rest {poses}"
 
 
 def follow_load(
@@ -99,7 +99,7 @@ def follow_load(
         compliance: 1/K, broadcast against (..., n); zero for a rigid joint [rad/(N·m)].
         torque: τ(q), from (..., n) to (..., n) [N·m].
         torque_gradient: ∂τ/∂q, from (..., n) to (..., n, n) [N·m/rad].
-        tolerance: Largest residual of the equation that is accepted, beside 1 rad [rad].
+        tolerance: Largest accepted residual of the equation, times 1 + max |q| [rad].
         rows: Rows to follow, (..., 1); the others stay at θ with the whole load. None for all.
         within: Lowest and highest angles of other equilibria that count, (n,) each [rad].
         unique: True to search for other equilibria.
@@ -116,10 +116,10 @@ def follow_load(
     for _ in range(_MOST_STEPS):
         target = np.minimum(load + step, 1.0)
         trial, is_stable = springs.settle(q, target, is_open)
-        taken = is_open & is_stable
-        q = np.where(taken, trial, q)
-        load = np.where(taken, target, load)
-        step = np.where(taken, 2.0 * step, 0.25 * step)
+        advances = is_open & is_stable
+        q = np.where(advances, trial, q)
+        load = np.where(advances, target, load)
+        step = np.where(advances, 2.0 * step, 0.25 * step)
         is_open = is_open & (load < 1.0)
         lost = is_open & (step < finest)
         if lost.any() or not is_open.any():

@@ -23,11 +23,10 @@ from mujoco import MjsBody, MjsJoint, MjSpec
 
 from elastic_env.core.errors import ConfigurationError, quote, require_known
 from elastic_env.core.signals import Array
-from elastic_env.joint import joint_names
 from elastic_env.joint.compile_model import compile_spec
 from elastic_env.joint.elasticity import ElasticJoint
 from elastic_env.joint.joint_drive import BLANK, ActuatorRule, drive_joint
-from elastic_env.joint.joint_names import motor_name, spring_name
+from elastic_env.joint.joint_names import friction_name, motor_name, servo_name, spring_name
 from elastic_env.joint.keyframes import carry_keyframes
 from elastic_env.joint.model_file import read_model
 from elastic_env.joint.supported_models import require_few, require_flags, require_hinge
@@ -154,8 +153,8 @@ def _choose_integrator(spec: MjSpec) -> None:
     model = compile_spec(spec, "the elastic model")
     if is_stable(model):
         return
-    own = mujoco.mjtIntegrator(model.opt.integrator).name.removeprefix("mjINT_")
-    names = " and ".join(dict.fromkeys((own, "IMPLICITFAST")))
+    integrator = mujoco.mjtIntegrator(model.opt.integrator).name.removeprefix("mjINT_")
+    names = " and ".join(dict.fromkeys((integrator, "IMPLICITFAST")))
     step = f"at a physics step of {model.opt.timestep:g} s"
     model.opt.integrator = _IMPLICITFAST
     if not is_stable(model):
@@ -166,7 +165,7 @@ def _choose_integrator(spec: MjSpec) -> None:
         )
     spec.option.integrator = _IMPLICITFAST
     warnings.warn(
-        f"the elastic joints explode with {own} {step}; the elastic model has the integrator"
+        f"the elastic joints explode with {integrator} {step}; the elastic model has the integrator"
         " IMPLICITFAST, which follows them",
         stacklevel=3,
     )
@@ -187,11 +186,11 @@ def _resolve_springdampers(spec: MjSpec, joints: list[str]) -> None:
 def _hinge(spec: MjSpec, name: str) -> MjsJoint:
     hinges = [joint for joint in spec.joints if joint.type == _HINGE and joint.name]
     require_known("hinge", [name], [hinge.name for hinge in hinges])
-    taken = {part.name for part in [*spec.joints, *spec.tendons, *spec.actuators]}
-    taken |= {motor_name(name)} & {body.name for body in spec.bodies}
-    taken |= {number.name for number in spec.numerics}
-    for derived in joint_names.all_names(name):
-        if derived in taken:
+    used = {part.name for part in [*spec.joints, *spec.tendons, *spec.actuators]}
+    used |= {motor_name(name)} & {body.name for body in spec.bodies}
+    used |= {number.name for number in spec.numerics}
+    for derived in (motor_name(name), spring_name(name), servo_name(name), friction_name(name)):
+        if derived in used:
             raise ConfigurationError(
                 f"{derived!r} already exists in the model; is the hinge {name!r} elastic already?"
             )

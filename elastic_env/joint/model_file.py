@@ -17,7 +17,7 @@ from elastic_env.core.errors import ConfigurationError, quote
 from elastic_env.joint.compile_model import call_mujoco, compile_spec, require_sound
 from elastic_env.joint.model_bounds import require_bounds
 from elastic_env.joint.model_text import ModelText, read_model_text
-from elastic_env.joint.urdf import keep_shapes, require_robot_tree, urdf_spec
+from elastic_env.joint.urdf import keep_shapes, require_tree, require_unique_names, urdf_spec
 
 GivenModel = str | Path | MjSpec | MjModel
 """A file of MJCF (.xml) or URDF (.urdf), the text of one, a specification, or a compiled model."""
@@ -98,7 +98,8 @@ def read_model(model: GivenModel, shapes: bool = False) -> ReadModel:
 
 def _read_urdf(text: ModelText, shapes: bool) -> ReadModel:
     """Read a URDF, and check it without its shapes."""
-    require_robot_tree(text)
+    require_unique_names(text)
+    require_tree(text)
     bare = copy.deepcopy(text.root)
     keep_shapes(bare, None)
     spec = urdf_spec(bare, text.name)

@@ -40,7 +40,7 @@ def position_servo(model: MjModel, joint: str) -> ModelServo | None:
     actuators = _actuators(model, joint)
     if (model.actuator_gaintype[actuators] == mujoco.mjtGain.mjGAIN_DCMOTOR).any():
         raise ConfigurationError(
-            f"joint {joint!r} has a dcmotor, whose gains are not read; say position_gain, and"
+            f"joint {joint!r} has a dcmotor, whose gains are not read; give position_gain, and"
             " `motor` with torque_constant, back_emf, resistance and voltage, under `servo` of this"
             " joint in `joints`"
         )
@@ -62,7 +62,7 @@ def position_servo(model: MjModel, joint: str) -> ModelServo | None:
     if not is_servo or bias[0] != 0.0 or kp <= 0.0 or kv < 0.0 or gear == 0.0:
         raise ConfigurationError(
             f"the actuators of joint {joint!r} are no single position servo of the form kp (u - q)"
-            " - kv q_dot; say its position_gain, velocity_gain and integral_gain under `servo` of"
+            " - kv q_dot; give its position_gain, velocity_gain and integral_gain under `servo` of"
             " this joint in `joints`"
         )
     braking = gear**2 * kv + _braking(model, joint)
@@ -136,7 +136,7 @@ def _smaller_end(joint: str, scale: float, is_limited: bool, interval: Array) ->
     if not lowest < 0.0 < highest:
         raise ConfigurationError(
             f"a force range of joint {joint!r} is {lowest:g} to {highest:g}, and a servo has to"
-            " push both ways; say its torque_limit [N·m] under `servo` of this joint in `joints`,"
+            " push both ways; give its torque_limit [N·m] under `servo` of this joint in `joints`,"
             " or mend the range"
         )
     return scale * min(-lowest, highest)

@@ -131,16 +131,16 @@ def _transition(model: mujoco.MjModel) -> Array:
     size = 2 * model.nv + model.na
     data = mujoco.MjData(model)
     A = np.empty((size, size))
-    rest = data.qpos.copy()
+    reference = data.qpos.copy()
 
     def step(change: Array) -> Array:
         mujoco.mj_resetData(model, data)
         dq, data.qvel[:], data.act[:] = np.split(change, [model.nv, 2 * model.nv])
         mujoco.mj_integratePos(model, data.qpos, dq, 1.0)
         mujoco.mj_step(model, data)
-        moved = np.empty(model.nv)
-        mujoco.mj_differentiatePos(model, moved, 1.0, rest, data.qpos)
-        return np.concatenate([moved, data.qvel, data.act])
+        displacement = np.empty(model.nv)
+        mujoco.mj_differentiatePos(model, displacement, 1.0, reference, data.qpos)
+        return np.concatenate([displacement, data.qvel, data.act])
 
     for column, change in enumerate(_DIFFERENCE * np.eye(size)):
         A[:, column] = (step(change) - step(-change)) / (2.0 * _DIFFERENCE)

@@ -20,19 +20,12 @@ _PACKAGE = "package://"
 _URDF_OPTIONS = {"fusestatic": "false", "strippath": "false", "discardvisual": "false"}
 
 
-def require_robot_tree(text: ModelText) -> None:
-    """Refuse a URDF whose links and joints are no tree with unique names.
+def require_unique_names(text: ModelText) -> None:
+    """Refuse a name that two links or two joints have: MuJoCo drops the second one.
 
     Raises:
-        ConfigurationError: Two links or two joints have one name, a joint names a link that does
-            not exist, or the links form a loop.
+        ConfigurationError: There is such a name.
     """
-    _require_unique_names(text)
-    _require_tree(text)
-
-
-def _require_unique_names(text: ModelText) -> None:
-    """Refuse a name that two links or two joints have: MuJoCo drops the second one."""
     for kind in ("link", "joint"):
         names = Counter(element.get("name", "") for element in text.root.findall(kind))
         twice = [name for name, count in names.items() if count > 1 and name]
@@ -43,8 +36,12 @@ def _require_unique_names(text: ModelText) -> None:
             )
 
 
-def _require_tree(text: ModelText) -> None:
-    """Refuse links that form a loop, and joints with links that do not exist."""
+def require_tree(text: ModelText) -> None:
+    """Refuse links that form a loop, and joints with links that do not exist.
+
+    Raises:
+        ConfigurationError: There is such a link or joint.
+    """
     links = {link.get("name", "") for link in text.root.findall("link")}
     parents: dict[str, str] = {}
     for joint in text.root.findall("joint"):

@@ -251,7 +251,8 @@ class Circle(_Path):
         """A plan of all joints, (T, n)."""
         length = np.linalg.norm(self.normal)
         if not length > 0.0:
-            raise ConfigurationError("normal of a circle must have a length > 0, such as [0, 1, 0]")
+            problem = "normal of a circle must have a length > 0, such as [0, 1, 0]"
+            raise ConfigurationError(problem)
         axis = np.array(self.normal) / length
         down = np.cross(np.cross(axis, np.eye(3)[np.abs(axis).argmin()]), axis)
         across = np.cross(axis, down)

@@ -51,11 +51,11 @@ def sole_gap(positions: Array, yaw: Array, half_size: tuple[float, float]) -> Ar
         (...) [m]; at most the distance by which the middle of the left sole is to the left.
     """
     half = np.array(half_size)
-    apart = positions[..., 0, :] - positions[..., 1, :]
+    offset = positions[..., 0, :] - positions[..., 1, :]
     corners = half * np.array([[1.0, 1.0], [1.0, -1.0]])
-    turned = (yaw[..., 0] - yaw[..., 1])[..., None]
+    relative_yaw = (yaw[..., 0] - yaw[..., 1])[..., None]
     # extent of the other sole along the sides of a sole
-    other = np.abs(turn(corners, turned)).max(axis=-2)
-    gaps = [np.abs(turn(apart, -yaw[..., foot])) - half - other for foot in range(2)]
-    aside = turn(apart, -yaw.mean(axis=-1))[..., 1]
+    other_extent = np.abs(turn(corners, relative_yaw)).max(axis=-2)
+    gaps = [np.abs(turn(offset, -yaw[..., foot])) - half - other_extent for foot in range(2)]
+    aside = turn(offset, -yaw.mean(axis=-1))[..., 1]
     return np.minimum(np.concatenate(gaps, axis=-1).max(axis=-1), aside)

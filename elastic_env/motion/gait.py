@@ -174,11 +174,11 @@ def step_timing(gait: Gait, control_period_s: float) -> Timing:
     step = np.clip((since - 1) // period, 0, gait.num_steps - 1)
     within = since - step * period - first  # control steps since lift-off
     swing = np.clip(within / single, 0.0, 1.0)
-    around = int((TRANSITION_S + 1e-9) / control_period_s)
+    half_width = int((TRANSITION_S + 1e-9) / control_period_s)
     transition = np.zeros(len(time), dtype=np.bool_)
     for lift_off in begin + np.arange(gait.num_steps) * period + first:
         for event in (lift_off, lift_off + single):
-            transition[event - around : event + around + 1] = True
+            transition[event - half_width : event + half_width + 1] = True
     walking = (since > 0) & (since <= gait.num_steps * period)
     return Timing(
         time=time,
@@ -213,8 +213,8 @@ class Footholds:
         blend = minimum_jerk(timing.swing)[:, None]
         before = timing.step
         after = before + 1
-        moved = self.positions[after] - self.positions[before]
-        positions = self.positions[before] + blend[..., None] * moved
+        motion = self.positions[after] - self.positions[before]
+        positions = self.positions[before] + blend[..., None] * motion
         yaw = self.yaw[before] + blend * (self.yaw[after] - self.yaw[before])
         return positions, yaw
 
@@ -230,9 +230,9 @@ def footholds(gait: Gait, feet: Array) -> Footholds:
         feet: Middles of the soles where the robot stands with its usual width, left first, (2, 2)
             [m].
     """
-    beside = np.array(feet)
+    standing = np.array(feet)
     if gait.step_width_m is not None:
-        beside[:, 1] = feet[:, 1].mean() + np.array([0.5, -0.5]) * gait.step_width_m
+        standing[:, 1] = feet[:, 1].mean() + np.array([0.5, -0.5]) * gait.step_width_m
     # a pair of feet for each step, closed by the last one; a step sets one foot of a pair
     turns = gait.turn_rad * np.arange(gait.num_steps)
     yaw = np.append(turns, turns[-1])
@@ -246,7 +246,7 @@ def footholds(gait: Gait, feet: Array) -> Footholds:
     pair = np.repeat(steps[:, None], 2, axis=1)
     pair[1:, LEFT] -= steps[1:] % 2 == 1
     pair[1:, RIGHT] -= steps[1:] % 2 == 0
-    return Footholds(middle[pair] + turn(beside, yaw[pair]), yaw[pair])
+    return Footholds(middle[pair] + turn(standing, yaw[pair]), yaw[pair])
 
 
 def zmp_reference(gait: Gait, timing: Timing, feet: Footholds) -> Array:

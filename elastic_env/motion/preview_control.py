@@ -99,9 +99,8 @@ def follow_zmp(config: PreviewConfig, zmp_ref: Array, start: Array) -> ComMotion
         ElasticError: Shapes that do not fit.
     """
     if zmp_ref.ndim != 2 or start.shape != zmp_ref.shape[1:]:
-        raise ElasticError(
-            f"zmp_ref must be (T, d) and start (d,), got {zmp_ref.shape} and {start.shape}"
-        )
+        got = f"got {zmp_ref.shape} and {start.shape}"
+        raise ElasticError(f"zmp_ref must be (T, d) and start (d,), {got}")
     A, b, c = cart_table(config)
     gains = preview_gains(config)
     steps, dimensions = zmp_ref.shape

@@ -104,9 +104,8 @@ class Hold(_JointReference):
 
     def _check(self) -> None:
         if self.upper <= self.lower:
-            raise ValueError(
-                f"upper must exceed lower, got lower {self.lower} and upper {self.upper}"
-            )
+            got = f"got lower {self.lower} and upper {self.upper}"
+            raise ValueError(f"upper must exceed lower, {got}")
 
     @property
     def angles(self) -> Array:
@@ -240,9 +239,8 @@ class Multisine(_Oscillation):
 
     def _check(self) -> None:
         if self.highest_hz <= self.lowest_hz:
-            raise ValueError(
-                f"highest_hz must exceed lowest_hz, got {self.lowest_hz} to {self.highest_hz} Hz"
-            )
+            got = f"got {self.lowest_hz} to {self.highest_hz} Hz"
+            raise ValueError(f"highest_hz must exceed lowest_hz, {got}")
         if self.components * self.duration_s > _LONGEST_SUM_S:
             raise ValueError(
                 f"components x duration_s must be at most {_LONGEST_SUM_S:g} s, got"

@@ -71,5 +71,5 @@ def _angles(biped: Biped, pelvis: Array, ankles: Array, x: Array) -> Array:
     """Return joint angles that keep both soles on the ground, from pelvis motions (n, 6)."""
     R = _rotations(x)
     relative = (ankles - (pelvis + x[:, :3])[:, None]) @ R - biped.hips
-    turned = np.broadcast_to(R.swapaxes(-1, -2)[:, None], (len(x), 2, 3, 3))
-    return legs.leg_angles(biped.leg, relative, turned).reshape(len(x), -1)
+    feet_R = np.broadcast_to(R.swapaxes(-1, -2)[:, None], (len(x), 2, 3, 3))
+    return legs.leg_angles(biped.leg, relative, feet_R).reshape(len(x), -1)

@@ -214,24 +214,24 @@ def refine_plan(plan: WalkPlan, biped: Biped, control_period_s: float) -> WalkPl
     preview = PreviewConfig(
         com_height_m=plan.com_height, period_s=control_period_s, gravity=plan.gravity
     )
-    further = follow_zmp(preview, plan.zmp - plan.zmp_of_motion, np.zeros(2))
+    correction = follow_zmp(preview, plan.zmp - plan.zmp_of_motion, np.zeros(2))
     # this robot may carry more than the one of the plan
     from_pelvis = turn(biped.chains.center_of_mass(plan.q), plan.heading)
-    com = (plan.pelvis + from_pelvis)[:, :2] + further.com
+    com = (plan.pelvis + from_pelvis)[:, :2] + correction.com
     feet = Feet(plan.ankles, plan.foot_yaw, plan.heading)
     pelvis = _pelvis_under(com, plan.pelvis, biped, feet, plan.timing.time)
     q = _joint_angles(biped, pelvis, feet, plan.timing.time)
     q_dot, q_ddot = derivatives(q, control_period_s)
-    moved = replace(
+    refined = replace(
         plan,
         q=q,
         q_dot=q_dot,
         q_ddot=q_ddot,
         com=com,
-        com_dot=plan.com_dot + further.com_dot,
+        com_dot=plan.com_dot + correction.com_dot,
         pelvis=pelvis,
     )
-    return with_torque(moved, biped, control_period_s)
+    return with_torque(refined, biped, control_period_s)
 
 
 def with_torque(plan: WalkPlan, biped: Biped, control_period_s: float) -> WalkPlan:
@@ -276,9 +276,8 @@ def swing_height(progress: Array) -> Array:
 
 
 def _foot_paths(gait: Gait, timing: Timing, holds: Footholds, biped: Biped) -> Feet:
-    positions, yaw = holds.paths(timing)
     ankles = np.empty((len(timing.time), 2, 3))
-    ankles[..., :2] = positions
+    ankles[..., :2], yaw = holds.paths(timing)
     ankles[..., 2] = biped.ankle_height
     rows = np.arange(len(timing.time))
     ankles[rows, RIGHT - timing.support, 2] += gait.lift_m * swing_height(timing.swing)

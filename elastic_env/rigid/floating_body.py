@@ -31,9 +31,8 @@ class FloatingBody:
         free_ids = np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)
         free = [model.joint(int(j)).name for j in free_ids]
         if len(free) != 1:
-            raise ConfigurationError(
-                f"a floating robot needs one free joint, this model has {len(free)}"
-            )
+            problem = f"a floating robot needs one free joint, this model has {len(free)}"
+            raise ConfigurationError(problem)
         require_hinge_tree(model, joints, but=free)
         self._model = pinocchio_model(model)
         self._data = self._model.createData()

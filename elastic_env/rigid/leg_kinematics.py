@@ -105,11 +105,11 @@ def turn(vectors: Array, angle: Array) -> Array:
     sine = np.sin(angle)
     x = vectors[..., 0]
     y = vectors[..., 1]
-    turned = np.empty(np.broadcast_shapes(vectors.shape, (*np.shape(angle), 1)))
-    turned[..., 0] = cosine * x - sine * y
-    turned[..., 1] = sine * x + cosine * y
-    turned[..., 2:] = vectors[..., 2:]
-    return turned
+    rotated = np.empty(np.broadcast_shapes(vectors.shape, (*np.shape(angle), 1)))
+    rotated[..., 0] = cosine * x - sine * y
+    rotated[..., 1] = sine * x + cosine * y
+    rotated[..., 2:] = vectors[..., 2:]
+    return rotated
 
 
 def rotation_of_tilt(attitude: Array) -> Array:

@@ -52,12 +52,12 @@ class EndEffector:
     def jacobian(self, q: Array) -> tuple[Array, Array]:
         """Derivative of position and turn in the world's axes, (..., 3, n) each [m/rad], [1]."""
         position, _, axes, anchors = self._chain_poses(q)
-        moved, turned = np.zeros((2, len(position), 3, self._n))
+        J_position, J_rotation = np.zeros((2, len(position), 3, self._n))
         columns = self._chain["column"][:-1]
-        moved[:, :, columns] = np.cross(axes, position[:, None] - anchors).swapaxes(1, 2)
-        turned[:, :, columns] = axes.swapaxes(1, 2)
+        J_position[:, :, columns] = np.cross(axes, position[:, None] - anchors).swapaxes(1, 2)
+        J_rotation[:, :, columns] = axes.swapaxes(1, 2)
         shape = (*q.shape[:-1], 3, self._n)
-        return moved.reshape(shape), turned.reshape(shape)
+        return J_position.reshape(shape), J_rotation.reshape(shape)
 
     def errors(self, q_ref: Array, q: Array) -> tuple[Array, Array]:
         """Distance (...) [m] and angle (...) [rad] between the poses of reference and joints."""

@@ -303,25 +303,25 @@ def chain_poses(links: Any, q: Array, place: Array, R: Array, axes: Array, ancho
         anchors: Output, points on these axes, (rows, len(links) - 1, 3) [m].
     """
     for row in range(len(q)):
-        turned = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
-        moved = (0.0, 0.0, 0.0)
+        rotation = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+        position = (0.0, 0.0, 0.0)
         for i in range(len(links)):
             link = links[i]
-            moved = add(moved, matvec(turned, as_vector(link["anchor"])))
-            turned = matmul(turned, as_matrix(link["R"]))
+            position = add(position, matvec(rotation, as_vector(link["anchor"])))
+            rotation = matmul(rotation, as_matrix(link["R"]))
             if i < len(links) - 1:
                 angle = q[row, link["column"]] - link["zero"]
                 c = math.cos(angle)
                 s = math.sin(angle)
-                xx, xy, xz, yx, yy, yz, zx, zy, zz = turned
+                xx, xy, xz, yx, yy, yz, zx, zy, zz = rotation
                 x = (c * xx + s * xy, c * xy - s * xx, xz)
                 y = (c * yx + s * yy, c * yy - s * yx, yz)
                 z = (c * zx + s * zy, c * zy - s * zx, zz)
-                turned = x + y + z
+                rotation = x + y + z
                 write_vector(axes[row, i], (xz, yz, zz))
-                write_vector(anchors[row, i], moved)
-        write_vector(place[row], moved)
-        write_matrix(R[row], turned)
+                write_vector(anchors[row, i], position)
+        write_vector(place[row], position)
+        write_matrix(R[row], rotation)
 
 
 @compiled
