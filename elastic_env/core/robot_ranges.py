@@ -72,15 +72,15 @@ class RobotRanges(Model):
     """
 
     stiffness: Interval = interval("1", 1.0, bounds=(0.05, 20))
-    """Factor on K, of all joints together [1]."""
+    """Factor on K, the same for all joints [1]."""
     joint_stiffness: Interval = interval("1", 1.0, bounds=(0.05, 20))
-    """Further factor on K, of every joint its own [1]."""
+    """Further factor on K, drawn for each joint [1]."""
     damping: Interval = interval("1", 1.0, bounds=(0, 100))
-    """Factor on D, of all joints together [1]."""
+    """Factor on D, the same for all joints [1]."""
     friction: Interval = interval("1", 1.0, bounds=(0, 100))
-    """Factor on dry and viscous friction, of all joints together [1]."""
+    """Factor on dry and viscous friction, the same for all joints [1]."""
     backlash_rad: Interval = interval("rad", 0.0, bounds=(0, 0.1))
-    """Further dead band of every joint, the same in all [rad]."""
+    """Additional dead band, the same for all joints [rad]."""
     load_kg: Interval = interval("kg", 0.0, bounds=(0, 100))
     """Load on the torso [kg]."""
     load_x_m: Interval = interval("m", _SHOULDERS_M[0], bounds=(-1, 1))
@@ -90,9 +90,9 @@ class RobotRanges(Model):
     load_z_m: Interval = interval("m", _SHOULDERS_M[1], bounds=(-1, 1))
     """The same, above it; by default on the shoulders [m]."""
     homing_rad: Interval = interval("rad", 0.0, bounds=(-0.1, 0.1))
-    """Error of the encoders, of every joint its own [rad]."""
+    """Error of the encoders, drawn for each joint [rad]."""
     mounting_rad: Interval = interval("rad", 0.0, bounds=(-0.1, 0.1))
-    """Error of the IMU, of roll and pitch each its own [rad]."""
+    """Error of the IMU, drawn for roll and for pitch [rad]."""
     slope_rad: Interval = interval("rad", 0.0, bounds=(0, 0.5))
     """Slope of the floor, in any direction [rad]."""
     push_n: Interval = interval("N", 0.0, bounds=(0, 1000))
@@ -104,7 +104,7 @@ class RobotRanges(Model):
     inertial_share: float = quantity("1", 0.0, ge=0, le=1)
     """Share of the robots whose IMU computes its attitude [1]."""
     force_bias_n: Interval = interval("N", 0.0, bounds=(-1000, 1000))
-    """Bias of a foot's force sensor, of every foot and axis its own [N]."""
+    """Bias of a foot's force sensor, drawn for each foot and axis [N]."""
     moment_bias_nm: Interval = interval("N·m", 0.0, bounds=(-100, 100))
     """Bias of its moments, likewise [N·m]."""
     force_drift_n_s: Interval = interval("N/s", 0.0, bounds=(-100, 100))
@@ -112,8 +112,8 @@ class RobotRanges(Model):
     moment_drift_nm_s: Interval = interval("N·m/s", 0.0, bounds=(-10, 10))
     """Rate at which the bias of its moments changes, likewise [N·m/s]."""
     cross_talk: Interval = interval("1", 0.0, bounds=(-1, 1))
-    """Share of the full scale of an axis that shows on another one, of every foot and pair of axes
-    its own [1]."""
+    """Share of the full scale of an axis that appears on another one, drawn for each foot and
+    pair of axes [1]."""
     floor_friction: Interval = interval("1", 1.0, bounds=(1e-6, 10))
     """Factor on the friction of soles and floor [1]."""
 

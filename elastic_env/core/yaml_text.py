@@ -66,9 +66,8 @@ class _Loader(Composer, yaml.CSafeLoader):
         size = 1 + sum(self._sizes[id(part)] for part in _parts(node))
         self._sizes[id(node)] = size
         if size > MOST_VALUES:
-            raise _refusal(
-                event, f"it must hold at most {MOST_VALUES} values, aliases counted in full"
-            )
+            problem = f"it must hold at most {MOST_VALUES} values, aliases counted in full"
+            raise _refusal(event, problem)
         return node
 
     def construct_number(self, node: Any) -> int | float:

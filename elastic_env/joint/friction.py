@@ -84,9 +84,9 @@ class FrictionTerms(Model):
     load_friction: float = quantity("1", 0.0, ge=0, lt=1)
     """c, share of the torque passed that is lost to dry friction, see `dry_friction` [1]."""
     static_friction: float = quantity("N·m", 0.0, ge=0)
-    """F_s, what dry friction has more at rest than in motion [N·m]."""
+    """F_s, excess of dry friction at rest over that in motion [N·m]."""
     stribeck_speed: float = quantity("rad/s", 0.0, ge=0)
-    """ω_s, speed by which that excess falls to 37 %; needed where there is one [rad/s]."""
+    """ω_s, speed at which that excess is down to 37 %; required with `static_friction` [rad/s]."""
 
     def _check(self) -> None:
         if self.static_friction > 0.0 and self.stribeck_speed == 0.0:

@@ -33,7 +33,7 @@ def drive_joint(
         rule: "keep" or "replace", see `make_elastic`.
 
     Raises:
-        ConfigurationError: A sensor reads an actuator that is replaced by nothing.
+        ConfigurationError: A sensor reads an actuator that is deleted, and there is no servo.
     """
     on_joints = [a for a in spec.actuators if a.trntype in _ON_JOINT]
     existing = [actuator for actuator in on_joints if actuator.target == name]

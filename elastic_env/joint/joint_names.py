@@ -24,12 +24,9 @@ def servo_name(joint: str) -> str:
     return f"{joint}_servo"
 
 
-FRICTION_SUFFIX = "_dry_friction"
-
-
 def friction_name(joint: str) -> str:
     """Name of the parameters of a varying dry friction."""
-    return f"{joint}{FRICTION_SUFFIX}"
+    return f"{joint}_dry_friction"
 
 
 @dataclass(frozen=True)

@@ -45,16 +45,16 @@ class ServoSettings(Model):
     position_gain: float | None = quantity("N·m/rad", None, ge=SOFTEST)
     """k_p; default that of the model's position actuator, else 50 K [N·m/rad]."""
     velocity_gain: float | None = quantity("N·m·s/rad", None, ge=0)
-    """k_v; default what damps the model's actuator; else 0 beside a position gain and a motor,
+    """k_v; default the damping of the model's actuator; else 0 with a position gain and a motor,
     whose back-EMF brakes; else critical damping [N·m·s/rad].
     """
     integral_gain: float | None = quantity("N·m/(rad·s)", None, ge=0)
-    """k_i; default 0 beside a position gain, else that of the model's actuator, else 5 k_p per
+    """k_i; default 0 with a position gain, else that of the model's actuator, else 5 k_p per
     second [N·m/(rad·s)].
     """
     torque_limit: float | None = quantity("N·m", None, gt=0)
-    """Default the model's force range, else what holds three times the weight and gives 20
-    rad/s² [N·m].
+    """Default the model's force range, else the torque for three times the weight and 20 rad/s²
+    [N·m].
     """
     speed_limit: float | None = quantity("rad/s", None, gt=0)
     """No-load speed; default that of the motor, else a turn a second [rad/s]."""
@@ -108,7 +108,7 @@ class JointSettings(FrictionTerms):
     stiffness: float = quantity("N·m/rad", ge=SOFTEST, allow_inf_nan=True)
     """K, stiffness of the transmission, without a default; infinite for a rigid joint [N·m/rad]."""
     damping: float | None = quantity("N·m·s/rad", None, ge=0)
-    """D; default a damping ratio of 0.17, or what brings the links to rest [N·m·s/rad]."""
+    """D; default a damping ratio of 0.17, or enough to bring the links to rest [N·m·s/rad]."""
     rotor_inertia: float | None = quantity("kg·m²", None, gt=0)
     """B; default the model's armature, else K/(100 rad/s)² or that of the links [kg·m²]."""
     coulomb_friction: float | None = quantity("N·m", None, ge=0)

@@ -208,7 +208,7 @@ class _Springs:
                 is_allowed = np.abs(found - self.theta) <= _WOUND_RAD
                 is_allowed = is_allowed & (found >= lowest) & (found <= highest)
                 is_allowed = is_allowed.all(axis=-1, keepdims=True)
-                # NaN is apart from nothing
+                # False for NaN
                 is_known = np.abs(found[..., i] - other[..., 0]) <= _OTHER_RAD
                 is_rest = (is_new & is_stable & is_apart & is_allowed)[..., 0]
                 is_other = is_rest & ~is_known

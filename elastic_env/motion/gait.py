@@ -52,19 +52,19 @@ class Gait(Model):
     num_steps: int = quantity("1", 4, ge=1, le=1000)
     """Number of steps [1]."""
     settling_steps: int = quantity("1", 0, ge=0)
-    """First steps, which are walked but not scored: ramps end in them [1]."""
+    """Number of first steps that are not scored: ramps end in them [1]."""
     step_length_m: float = quantity("m", 0.0, ge=-1, le=1)
-    """By how much a step sets its foot ahead of the other one, negative for backwards [m]."""
+    """Distance by which a step sets its foot ahead of the other one, negative for backwards [m]."""
     step_width_m: float | None = quantity("m", None, gt=0, le=1)
     """Distance of the feet side by side; None for that of the hips [m]."""
     turn_rad: float = quantity("rad", 0.0, ge=-1, le=1)
-    """By how much a step turns its foot against the other one, positive to the left [rad]."""
+    """Angle by which a step turns its foot from the other one, positive to the left [rad]."""
     lift_m: float = quantity("m", 0.025, gt=0)
     """Height to which the swing foot is lifted [m]."""
     hip_height_m: float = quantity("m", 0.66, gt=0)
     """Height of the hip axes over the ground [m]."""
     transfer: Literal["smooth", "ramp"] = "smooth"
-    """How the ZMP goes from foot to foot: over the whole double support, or within 0.1 s before
+    """Transfer of the ZMP from foot to foot: over the whole double support, or within 0.1 s before
     lift-off and after touch-down, 0.02 m inward of the ankle, as in the published controller of
     this robot's group."""
 

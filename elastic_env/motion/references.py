@@ -100,7 +100,7 @@ class Hold(_JointReference):
     measure_s: float = quantity("s", 0.5, gt=0, le=3600)
     """Time of the measurement [s]."""
     overrun: float = quantity("rad", 0.08, gt=0)
-    """How far the sweep starts and turns outside the positions [rad]."""
+    """Distance outside the positions at which the sweep starts and turns [rad]."""
 
     def _check(self) -> None:
         if self.upper <= self.lower:
