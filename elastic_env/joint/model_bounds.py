@@ -81,13 +81,13 @@ class _Counts:
 
     def add_urdf(self, robot: ET.Element) -> None:
         """Count the parts of a URDF."""
-        self._require_at_most("elements", sum(1 for _ in robot.iter()), MOST_ELEMENTS)
-        self._require_at_most("bodies", len(robot.findall("link")), MOST_BODIES)
+        self._limit("elements", sum(1 for _ in robot.iter()), MOST_ELEMENTS)
+        self._limit("bodies", len(robot.findall("link")), MOST_BODIES)
         joints = robot.findall("joint")
         moving = [joint for joint in joints if joint.get("type") != "fixed"]
-        self._require_at_most("joints", len(moving), MOST_JOINTS)
+        self._limit("joints", len(moving), MOST_JOINTS)
         for element in robot.iter():
-            self._require_numbers(element)
+            self._check_attributes(element)
         for mesh in robot.iter("mesh"):
             self._add_asset(mesh.get("filename", "").removeprefix("file://"))
 
@@ -122,14 +122,14 @@ class _Counts:
             copies *= max(_number(element.get("count", "1")), 1.0)
         in_world = in_world or tag in _WORLD
         self.elements += copies
-        self._require_at_most("elements", self.elements, MOST_ELEMENTS)
+        self._limit("elements", self.elements, MOST_ELEMENTS)
         if tag == "body":
             self.bodies += copies
-            self._require_at_most("bodies", self.bodies, MOST_BODIES)
+            self._limit("bodies", self.bodies, MOST_BODIES)
         if in_world and tag in _JOINTS:
             self.joints += copies
-            self._require_at_most("joints", self.joints, MOST_JOINTS)
-        self._require_numbers(element)
+            self._limit("joints", self.joints, MOST_JOINTS)
+        self._check_attributes(element)
         if tag == "include":
             self._include(element.get("file", ""), files, copies, in_world, depth)
         elif tag == "model":
@@ -192,41 +192,36 @@ class _Counts:
             if not stat.S_ISREG(status.st_mode):
                 problem = f"names {name_of(path)}, which is no regular file"
                 raise ConfigurationError(f"{self.model.name} {problem}")
-            self._require_at_most(f"bytes of {name_of(name)}", status.st_size, LARGEST_BYTES)
+            self._limit(f"bytes of {name_of(name)}", status.st_size, LARGEST_BYTES)
             self.asset_bytes += status.st_size
-            self._require_at_most(
-                "bytes of meshes and pictures", self.asset_bytes, MOST_ASSET_BYTES
-            )
+            self._limit("bytes of meshes and pictures", self.asset_bytes, MOST_ASSET_BYTES)
             self.pixels += _pixels(path)
-            self._require_at_most("pixels of pictures", self.pixels, MOST_PIXELS)
+            self._limit("pixels of pictures", self.pixels, MOST_PIXELS)
 
-    def _require_numbers(self, element: ET.Element) -> None:
+    def _check_attributes(self, element: ET.Element) -> None:
+        """Refuse attributes that are too large or NaN."""
         tag = element.tag
         values = element.attrib
         for of_tag, names, most in _LARGEST:
             if of_tag in ("", tag) and any(name in values for name in names):
                 numbers = [n for name in names for n in _numbers(values.get(name, ""))]
-                self._require_at_most(
-                    f"{' times '.join(names)} of <{tag}>", _product(numbers), most
-                )
+                self._limit(f"{' times '.join(names)} of <{tag}>", _product(numbers), most)
         for name, value in values.items():
             if name.startswith(_PREFIXES[:1]) or name.endswith(_PREFIXES[1:]):
                 product = _product(_numbers(value))
-                self._require_at_most(f"{name} of <{tag}>", product, _LARGEST_PRODUCT)
+                self._limit(f"{name} of <{tag}>", product, _LARGEST_PRODUCT)
             if name != "name" and _has_nan(value):
                 raise ConfigurationError(
                     f"{name} of <{tag}> in {self.model.name} must be numbers, got {quote(value)}"
                 )
         if tag == "texture" and {"width", "height"} <= set(values):
             self.pixels += _product([*_numbers(values["width"]), *_numbers(values["height"])])
-            self._require_at_most("pixels of pictures", self.pixels, MOST_PIXELS)
+            self._limit("pixels of pictures", self.pixels, MOST_PIXELS)
         if tag == "mesh" and "params" in values:
             resolution = max(_numbers(values["params"]), default=0.0)
-            self._require_at_most("as params of a mesh", resolution, _FINEST_MESH)
+            self._limit("as params of a mesh", resolution, _FINEST_MESH)
         if tag == "size" and "memory" in values:
-            self._require_at_most(
-                "memory of <size> [bytes]", _bytes(values["memory"]), _MOST_MEMORY
-            )
+            self._limit("memory of <size> [bytes]", _bytes(values["memory"]), _MOST_MEMORY)
         if tag == "lengthrange" and "timestep" in values:
             step = _number(values["timestep"])
             if not step >= _SHORTEST_STEP_S:
@@ -234,7 +229,8 @@ class _Counts:
                 name = self.model.name
                 raise ConfigurationError(f"timestep of <lengthrange> in {name} {needed}")
 
-    def _require_at_most(self, what: str, value: float, most: float) -> None:
+    def _limit(self, what: str, value: float, most: float) -> None:
+        """Refuse a count or size above its bound."""
         if not value <= most:
             raise ConfigurationError(
                 f"{self.model.name} must have at most {most:.15g} {what}, copies counted, it has"
