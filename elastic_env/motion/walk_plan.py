@@ -276,6 +276,7 @@ def swing_height(progress: Array) -> Array:
 
 
 def _foot_paths(gait: Gait, timing: Timing, holds: Footholds, biped: Biped) -> Feet:
+    """Return the paths of the feet, with the heights of their swings."""
     ankles = np.empty((len(timing.time), 2, 3))
     ankles[..., :2], yaw = holds.paths(timing)
     ankles[..., 2] = biped.ankle_height
@@ -312,27 +313,33 @@ def _pelvis_under(com: Array, start: Array, biped: Biped, feet: Feet, t: Array) 
 
 
 def _joint_angles(biped: Biped, pelvis: Array, feet: Feet, time: Array) -> Array:
+    """Solve the inverse kinematics of all rows."""
     try:
         return biped.joint_angles(pelvis, feet.ankles, feet.heading, feet.yaw)
     except ElasticError:
-        from_pelvis = turn(feet.ankles - pelvis[:, None], -feet.heading[:, None])
-        from_hip = from_pelvis - biped.hips
-        reach = biped.leg.reach
-        distance = np.linalg.norm(from_hip, axis=-1)
-        row, leg = np.unravel_index(int(np.argmax(distance)), distance.shape)
-        x, y, z = from_hip[row, leg]
-        vertical = "lift_m" if z > 0.0 else "hip_height_m"
-        # distance without the part of each parameter: below the reach, the parameter can cure it
-        other_parts = {
-            vertical: np.hypot(x, y),
-            "hip_half_spacing": np.hypot(x, z),
-            "step_length_m": np.hypot(y, z),
-        }
-        cures = [name for name, rest in other_parts.items() if rest < reach]
-        excess = max(float(distance[row, leg]) - reach, np.finfo(np.float64).eps)
-        decimals = max(4, -int(np.floor(np.log10(excess))))
-        raise ConfigurationError(
-            f"the {('left', 'right')[leg]} foot is out of reach at {time[row]:.3f} s:"
-            f" {distance[row, leg]:.{decimals}f} m from the hip to the ankle, at most {reach:g} m;"
-            f" lower {' or '.join(cures or [vertical])}"
-        ) from None
+        raise _reach_error(biped, pelvis, feet, time) from None
+
+
+def _reach_error(biped: Biped, pelvis: Array, feet: Feet, time: Array) -> ConfigurationError:
+    """Return the error for the foot that is farthest out of reach, and parameters to lower."""
+    from_pelvis = turn(feet.ankles - pelvis[:, None], -feet.heading[:, None])
+    from_hip = from_pelvis - biped.hips
+    reach = biped.leg.reach
+    distance = np.linalg.norm(from_hip, axis=-1)
+    row, leg = np.unravel_index(int(np.argmax(distance)), distance.shape)
+    x, y, z = from_hip[row, leg]
+    vertical = "lift_m" if z > 0.0 else "hip_height_m"
+    # distance without the part of each parameter: below the reach, the parameter can cure it
+    other_parts = {
+        vertical: np.hypot(x, y),
+        "hip_half_spacing": np.hypot(x, z),
+        "step_length_m": np.hypot(y, z),
+    }
+    cures = [name for name, rest in other_parts.items() if rest < reach]
+    excess = max(float(distance[row, leg]) - reach, np.finfo(np.float64).eps)
+    decimals = max(4, -int(np.floor(np.log10(excess))))
+    return ConfigurationError(
+        f"the {('left', 'right')[leg]} foot is out of reach at {time[row]:.3f} s:"
+        f" {distance[row, leg]:.{decimals}f} m from the hip to the ankle, at most {reach:g} m;"
+        f" lower {' or '.join(cures or [vertical])}"
+    )
