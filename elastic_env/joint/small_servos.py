@@ -13,7 +13,7 @@ Going down the source's friction is larger than ours, by (1 + s)/(1 − s). Figu
 ROBOTIS' e-manual and, for the STS3250, Feetech's sheet of 2024-01-16 as quoted by robonine.com. All
 are at the output shaft. A sheet's stall torque is what the servo still lifts, so that the motor has
 (τ + F₀)/(1 − c). In the recordings of that repository's branch `xl330` the PWM register is 2.546 g
-per rad of error, half of what the e-manual says of the X series.
+per rad of error, half of the e-manual's value for the X series.
 
 | servo | k_t, k_e, R | rotor, friction | κ, g | k_p |
 |---|---|---|---|---|

@@ -39,8 +39,8 @@ def require_clear_feet(feet: Footholds, sole_half_size: tuple[float, float]) -> 
 def sole_gap(positions: Array, yaw: Array, half_size: tuple[float, float]) -> Array:
     """Return the gap between two soles along the best of their sides, negative for an overlap.
 
-    The right sole must be to the right of a side of the left one, or in front of it or behind it
-    with its middle to the right, and likewise the other way round.
+    The right sole must be to the right of a side of the left one. Or it is in front of it or behind
+    it, with its middle to the right. The same holds the other way round.
 
     Args:
         positions: Middles of the soles, left first, (..., 2, 2) [m].

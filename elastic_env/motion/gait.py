@@ -222,7 +222,7 @@ class Footholds:
 def footholds(gait: Gait, feet: Array) -> Footholds:
     """Return the footholds of a gait.
 
-    A step sets its foot beside the support foot, one turn further, then moves it by the step length
+    A step sets its foot beside the support foot, turned by one turn, and ahead by the step length,
     along the heading halfway through the turn. The last step closes the feet side by side.
 
     Args:

@@ -3,8 +3,8 @@
 The pelvis stays level at one height, with the mean heading of the feet. It moves so that the center
 of mass of the whole robot follows the preview control.
 
-Swinging legs move the ZMP away from that of the cart-table, by 2.5 mm rms in steps of 3 s and by
-9 mm in steps of 1.1 s. A second pass of the preview control on the error of the ZMP [Kajita2003]
+Swinging legs move the ZMP away from that of the cart-table: 2.5 mm rms in steps of 3 s, 9 mm in
+steps of 1.1 s. A second pass of the preview control on the error of the ZMP [Kajita2003]
 leaves about a seventh of it. Plans of a robot that does not walk in place have this second pass. A
 policy can walk a plan with a further pass (`baselines.walking.foothold`).
 

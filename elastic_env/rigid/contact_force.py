@@ -1,12 +1,12 @@
 r"""Shares of the feet in the ground's force: Eqs. 5 and 6 of the paper, contact at the ZMP.
 
-Each foot takes its share of the force, F_r = μ F and F_l = (1 − μ) F, at a point of its own, so
-that both together act at the ZMP:
+Each foot takes its share of the force, F_r = μ F and F_l = (1 − μ) F, at a point of its own. Both
+together act at the ZMP:
 
 .. math:: c_i = p_i + r, \quad r = p_{ZMP} - \mu p_r - (1 - \mu) p_l
 
-with the middles p_i of the soles. That balances any force, horizontal components included, and is
-continuous where μ reaches 0 or 1, so that nothing jumps at lift-off and touch-down.
+with the middles p_i of the soles. That balances any force, also horizontal ones. It is continuous
+where μ reaches 0 or 1, without jumps at lift-off and touch-down.
 """
 
 import numpy as np

@@ -1,8 +1,8 @@
 r"""Closed-form kinematics of a leg with six hinges: hip yaw, roll, pitch, knee, ankle pitch, roll.
 
-The three hip axes meet in a point, the two ankle axes in another; all link frames are parallel to
-the pelvis at zero angles, axes +z (yaw), +x (roll), +y (pitch), so that the foot's orientation in
-the pelvis is
+The three hip axes meet in a point, the two ankle axes in another. At zero angles all link frames
+are parallel to the pelvis. The axes are +z (yaw), +x (roll), +y (pitch). So the foot's orientation
+in the pelvis is
 
 .. math:: R = R_z(q_1) R_x(q_2) R_y(q_3) R_y(q_4) R_y(q_5) R_x(q_6)
 
