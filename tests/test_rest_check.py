@@ -31,7 +31,7 @@ def warned(q: Array, parts: list[slice]) -> list[str]:
         warnings.simplefilter("always")
         for part in parts:
             watch.see(rest[part], is_last[part], truth[part])
-    assert watch.is_said == bool(said)
+    assert watch.has_warned == bool(said)
     return [str(one.message) for one in said]
 
 

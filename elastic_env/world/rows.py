@@ -1,9 +1,9 @@
-"""Records of a control step: one per joint and one per world, with their fields by name.
+"""Records of a control step with named fields: one per joint and one per world.
 
-NumPy's structured types, which Numba compiles as they stand: `joints[world, i].truth.theta` in a
-kernel, `joints["truth"]["theta"]` in NumPy. A joint is a record, so the code that is compiled
-serves any number of joints. Truth is what the physics did. Measurements are what sensors show of
-it. Nothing is in both.
+They are NumPy's structured types, which Numba compiles: `joints[world, i].truth.theta` in a kernel,
+`joints["truth"]["theta"]` in NumPy. A joint is a record, so the compiled code serves any number of
+joints. `truth` is the state of the physics, `measured` are the readings of the sensors. No quantity
+is in both.
 """
 
 from collections.abc import Sequence
@@ -24,87 +24,87 @@ WHOLE = np.int64
 
 
 def record_type(*fields: tuple[Any, ...]) -> np.dtype[Any]:
-    """A structured type whose records have their fields as attributes, compiled or not.
+    """Return a structured type whose records have attributes, in NumPy and in compiled code.
 
-    Numbers are aligned, as a GPU reads no others.
+    Numbers are aligned, because a GPU cannot read others.
     """
     return np.dtype((np.record, np.dtype(list(fields), align=True)))
 
 
-def reals(names: str, shape: int | tuple[int, ...] = ()) -> list[tuple[Any, ...]]:
-    """Fields of real numbers of one shape."""
+def real_fields(names: str, shape: int | tuple[int, ...] = ()) -> list[tuple[Any, ...]]:
+    """Fields of real numbers, all of one shape."""
     return [(name, REAL, shape) for name in names.split()]
 
 
 _JOINT_TRUTH = record_type(
-    *reals("q_ref theta theta_dot q q_dot"),  # motor and link side [rad], [rad/s]
+    *real_fields("q_ref theta theta_dot q q_dot"),  # motor and link side [rad], [rad/s]
     # a, θ_cmd = q_ref + a [rad]; change of a [rad/s]
-    *reals("offset command command_rate"),
-    *reals("stiffness damping"),  # true K [N·m/rad] and D [N·m·s/rad]
-    *reals("backlash homing"),  # dead band, and what the encoder shows beyond θ [rad]
+    *real_fields("offset command command_rate"),
+    *real_fields("stiffness damping"),  # true K [N·m/rad] and D [N·m·s/rad]
+    *real_fields("backlash homing"),  # dead band, and the encoder's offset from θ [rad]
 )
-_JOINT_SHOWN = record_type(*reals("encoder encoder_before"))  # now and a step ago [rad]
-JOINT = record_type(("truth", _JOINT_TRUTH), ("shown", _JOINT_SHOWN))
-"""A joint in a control step. What is true of its spring and its encoder is drawn per episode."""
+_JOINT_MEASUREMENTS = record_type(*real_fields("encoder last_encoder"))  # now and a step ago [rad]
+JOINT = record_type(("truth", _JOINT_TRUTH), ("measured", _JOINT_MEASUREMENTS))
+"""A joint in a control step. Spring, backlash and homing error are drawn per episode."""
 
-COURSE: Any = (
+COMMON_TRUTH: Any = (
     ("step", WHOLE),  # control steps since the start of the episode
     ("command_rate", REAL),  # rms over the joints [rad/s]
-    ("clipped", np.bool_),  # whether the action was beyond its bounds
-    ("diverged", np.bool_),  # whether the world has no new state
+    ("clipped", np.bool_),  # the action was beyond its bounds
+    ("diverged", np.bool_),  # the world has no new state
 )
-"""Fields that the truth of every world has."""
+"""Fields in the truth of every world."""
 
 RULES = record_type(
     ("control_period_s", REAL),
-    ("is_delayed", np.bool_),  # whether measurements are shown a step late
-    ("count_rad", REAL),  # of the encoders, 0 for none
-    ("highest_rad_s", REAL),  # beyond it the simulation has diverged
+    ("is_delayed", np.bool_),  # measurements are observed a step late
+    ("count_rad", REAL),  # angle of an encoder count, 0 for continuous encoders
+    ("highest_rad_s", REAL),  # beyond this speed the simulation has diverged
 )
 """Rules of the joints of a world."""
 
 ADDRESS = record_type(
-    # in qpos, in qvel, in ctrl
+    # theta and q in qpos, theta_dot and q_dot in qvel, servo in ctrl
     *((name, WHOLE) for name in ("theta", "q", "theta_dot", "q_dot", "servo"))
 )
-"""Addresses of a joint in the physics."""
+"""Indices of a joint in the physics."""
 
-LINK_SCORES = record_type(*reals("link_error command_rate divergence"))
+LINK_SCORES = record_type(*real_fields("link_error command_rate divergence"))
 """Weighted terms of the reward of links on a fixed base, or their weights."""
 
 LINK_WORLD = record_type(
-    # as in a `Plan`
-    ("truth", record_type(*COURSE, ("scored", np.bool_), ("rest", WHOLE))),
-    # link angle now, and as old as the scenario has it [rad]
-    ("shown", record_type(*reals("imu visible_imu"))),
+    # scored and rest as in a `Plan`
+    ("truth", record_type(*COMMON_TRUTH, ("scored", np.bool_), ("rest", WHOLE))),
+    # link angle now, and with the scenario's delay [rad]
+    ("measured", record_type(*real_fields("imu visible_imu"))),
     ("scores", LINK_SCORES),
 )
 """A control step of a world with links on a fixed base."""
 
 LINK_CONSTANTS = record_type(
-    ("weights", LINK_SCORES), *reals("imu_noise_rad imu_bias_rad imu_sine_error_rad")
+    ("weights", LINK_SCORES), *real_fields("imu_noise_rad imu_bias_rad imu_sine_error_rad")
 )
 """Constants of links on a fixed base."""
 
 SCHEDULE = record_type(("scored", np.bool_), ("rest", WHOLE), ("imu_is_due", np.bool_))
-"""What is to happen in a control step, as in a `Plan`."""
+"""Schedule of a control step; scored and rest as in a `Plan`."""
 
 
 class Sample(NamedTuple):
-    """Control steps as they are scored, one or several, which nothing changes later.
+    """One or several control steps to be scored; nothing changes them later.
 
     Attributes:
-        joints: Of `JOINT`, (rows, n).
-        worlds: Of the task's `WORLD`, (rows,).
+        joints: Records of `JOINT`, (rows, n).
+        worlds: Records of the task's `world_type`, (rows,).
     """
 
     joints: Records
     worlds: Records
 
 
-def one(kind: np.dtype[Any], **values: Any) -> Records:
-    """One record with these values, (1,)."""
-    row = np.zeros(1, kind)
+def single_record(record: np.dtype[Any], **values: Any) -> Records:
+    """Return an array of one record with these values, (1,)."""
+    row = np.zeros(1, record)
     for name in row.dtype.names or ():
         row[name] = values.pop(name)
     assert not values
@@ -112,17 +112,17 @@ def one(kind: np.dtype[Any], **values: Any) -> Records:
     return row
 
 
-def addresses(model: mujoco.MjModel, joints: Sequence[str]) -> Records:
+def joint_addresses(model: mujoco.MjModel, joints: Sequence[str]) -> Records:
     """Records of `ADDRESS`, (n,)."""
-    known = JointAddresses.of(model, joints)
-    found = np.zeros(len(joints), ADDRESS)
+    in_state = JointAddresses.of(model, joints)
+    rows = np.zeros(len(joints), ADDRESS)
     for name in ("theta", "q", "theta_dot", "q_dot"):
-        found[name] = getattr(known, name)
-    found["servo"] = [model.actuator(servo_name(joint)).id for joint in joints]
-    return found
+        rows[name] = getattr(in_state, name)
+    rows["servo"] = [model.actuator(servo_name(joint)).id for joint in joints]
+    return rows
 
 
-def columns_of(table: SignalTable, groups: Sequence[str]) -> Records:
-    """First column of each of some groups, one record."""
-    kind = record_type(*((group, WHOLE) for group in groups))
-    return one(kind, **{group: table.group(group).start for group in groups})
+def first_columns(table: SignalTable, groups: Sequence[str]) -> Records:
+    """First column of each group in a table, as one record, (1,)."""
+    record = record_type(*((group, WHOLE) for group in groups))
+    return single_record(record, **{group: table.group(group).start for group in groups})

@@ -1,4 +1,4 @@
-"""The walker's records beside its joints: truth, measurements, scores, plan, constants."""
+"""Records of the walker in addition to its joints: truth, measurements, scores, plan, constants."""
 
 from dataclasses import dataclass
 
@@ -8,35 +8,35 @@ from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
 from elastic_env.robots.thormang.tables import GROUPS, MEASURED
 from elastic_env.world.robot_model import WalkerModel
-from elastic_env.world.rows import COURSE, REAL, WHOLE, reals, record_type
+from elastic_env.world.rows import COMMON_TRUTH, REAL, WHOLE, real_fields, record_type
 
-_FEET_WRENCH = (2, 2, 3)  # feet, force and moment, axes
+_WRENCH_SHAPE = (2, 2, 3)  # feet, force and moment, axes
 
 TRUTH = record_type(
-    *COURSE,
-    *reals("servo_torque"),  # rms over the joints [N·m]
-    *reals("pelvis", 3),  # position [m]
-    *reals("quaternion", 4),  # orientation w, x, y, z
-    # of its origin, where the IMU is, in the world [m/s]; in the frame of the pelvis [rad/s]
-    *reals("pelvis_velocity pelvis_rate", 3),
-    *reals("roll pitch tilt"),  # of yaw, pitch, roll; angle from the vertical [rad]
-    *reals("ankles", (2, 3)),  # positions [m]
-    # of the feet on the legs, in the frames of the feet [N], [N·m]
-    *reals("wrench", _FEET_WRENCH),
-    # vertical force of the ground on the feet [N]; ZMP, and drift of the feet that stand against
-    # the plan [m], nan where the feet are not loaded
-    *reals("force zmp drift", 2),
-    # step of the first touch in the second half of the swing, -1 before it
+    *COMMON_TRUTH,
+    *real_fields("servo_torque"),  # rms over the joints [N·m]
+    *real_fields("pelvis", 3),  # position [m]
+    *real_fields("quaternion", 4),  # orientation w, x, y, z
+    # velocity of the origin, where the IMU is, in the world [m/s]; rate in the pelvis frame [rad/s]
+    *real_fields("pelvis_velocity pelvis_rate", 3),
+    *real_fields("roll pitch tilt"),  # of yaw, pitch, roll; angle from the vertical [rad]
+    *real_fields("ankles", (2, 3)),  # positions [m]
+    # wrench of the feet on the legs, in the frames of the feet [N], [N·m]
+    *real_fields("wrench", _WRENCH_SHAPE),
+    # vertical force of the ground on the feet [N]; ZMP, and drift of the standing feet from the
+    # plan [m], nan where the feet are not loaded
+    *real_fields("force zmp drift", 2),
+    # step of the first touch-down in the second half of the swing, -1 before it
     ("contact_since", WHOLE),
 )
 """True state after a control step."""
 
-SHOWN = record_type(
-    *reals("imu_attitude", 2),  # roll and pitch [rad]
-    *reals("imu_rate", 3),  # as pelvis_rate [rad/s]
-    *reals("wrench", _FEET_WRENCH),  # as in the truth
-    # within an inertial IMU: vertical in its frame by its filter [1], rate by its gyroscope [rad/s]
-    *reals("imu_up imu_gyro", 3),
+MEASUREMENTS = record_type(
+    *real_fields("imu_attitude", 2),  # roll and pitch [rad]
+    *real_fields("imu_rate", 3),  # as pelvis_rate [rad/s]
+    *real_fields("wrench", _WRENCH_SHAPE),  # as in the truth
+    # in an inertial IMU: vertical in its frame by its filter [1], rate by its gyroscope [rad/s]
+    *real_fields("imu_up imu_gyro", 3),
 )
 """Measurements, and the state of an inertial IMU."""
 
@@ -48,61 +48,61 @@ the signals.
 """
 
 BIAS = record_type(
-    *reals("imu_attitude", 2),  # of mounting [rad]
-    *reals("gyro specific_force", 3),  # within an inertial IMU [rad/s], [m/s²]
-    # of the feet's sensors, as in `elastic_env.world.foot_sensors`
+    *real_fields("imu_attitude", 2),  # of mounting [rad]
+    *real_fields("gyro specific_force", 3),  # within an inertial IMU [rad/s], [m/s²]
+    # errors of the feet's sensors, as in `elastic_env.world.foot_sensors`
     ("has_foot_errors", np.bool_),
-    *reals("wrench wrench_rate", _FEET_WRENCH),  # [N], [N·m]; [N/s], [N·m/s]
-    *reals("cross_talk", (2, 6, 6)),
+    *real_fields("wrench wrench_rate", _WRENCH_SHAPE),  # [N], [N·m]; [N/s], [N·m/s]
+    *real_fields("cross_talk", (2, 6, 6)),
     ("skipped", WHOLE),  # control steps of the plan that the walk leaves out
-    # of the robot, where nothing measures them: load [kg] and its moments [kg·m], slope of the
-    # ground forward and to the left [rad], friction over the assumed one [1]
-    *reals("load", 3),
-    *reals("slope", 2),
-    *reals("friction"),
+    # properties of the robot that nothing measures: load [kg] and its moments [kg·m], slope of the
+    # ground forward and to the left [rad], friction over the assumed friction [1]
+    *real_fields("load", 3),
+    *real_fields("slope", 2),
+    *real_fields("friction"),
 )
-"""Errors of the sensors, length of the walk, and more that is drawn per episode."""
+"""Values drawn per episode: errors of the sensors, length of the walk, and robot."""
 
-SCORES = record_type(*reals("tilt zmp zmp_in_feet foot_drift effort smoothness fall"))
+SCORES = record_type(*real_fields("tilt zmp zmp_in_feet foot_drift effort smoothness fall"))
 """Weighted terms of the reward."""
 
-WORLD = record_type(("truth", TRUTH), ("shown", SHOWN), ("scores", SCORES))
+WORLD = record_type(("truth", TRUTH), ("measured", MEASUREMENTS), ("scores", SCORES))
 """A control step of a world."""
 
 ROW_OF_PLAN = record_type(
-    *reals("clock", 3),  # time, swing, support
-    *reals("share"),  # μ
-    *reals("zmp", 2),  # [m]
-    *reals("ankles", (2, 3)),  # [m]
+    *real_fields("clock", 3),  # time, swing, support
+    *real_fields("share"),  # μ
+    *real_fields("zmp", 2),  # [m]
+    *real_fields("ankles", (2, 3)),  # [m]
     ("half_of_swing", WHOLE),
     ("swing_foot", WHOLE),
     ("imu_is_due", np.bool_),
-    *reals("weight"),  # factor of tilt and zmp in the reward
+    *real_fields("weight"),  # factor of tilt and zmp in the reward
 )
-"""The plan as a control step needs it."""
+"""The walk plan in a control step."""
 
-INERTIAL = record_type(("is_fitted", np.bool_), *reals("time_constant_s gravity_m_s2"))
-"""An inertial IMU, one row beside every row of `CONSTANTS`.
+INERTIAL = record_type(("is_fitted", np.bool_), *real_fields("time_constant_s gravity_m_s2"))
+"""An inertial IMU; every row of `CONSTANTS` has one.
 
-Where none is fitted, the attitude comes with the errors that these have for it.
+Where none is fitted, the attitude has the errors in `CONSTANTS`.
 """
 
 CONSTANTS = record_type(
     ("ankles", WHOLE, 2),  # among the sites
-    *reals("foot_com foot_weight", (2, 3)),  # from the ankle [m], in the world [N]
+    *real_fields("foot_com foot_weight", (2, 3)),  # from the ankle [m], in the world [N]
     ("noise", NOISE),  # standard deviations
-    *reals("imu_bias_rad imu_sine_error_rad"),
-    *reals("lowest_pelvis_m highest_tilt_rad"),  # beyond them the robot has fallen
-    # vertical force of a loaded foot, and least one for a ZMP
-    *reals("loaded_n zmp_n"),
-    # control step from which a shorter walk goes on further behind
-    ("skips_at", WHOLE),
+    *real_fields("imu_bias_rad imu_sine_error_rad"),
+    *real_fields("lowest_pelvis_m highest_tilt_rad"),  # beyond these the robot has fallen
+    # least vertical force of a loaded foot, and least one of both feet for a ZMP
+    *real_fields("loaded_n zmp_n"),
+    # control step from which a shorter walk jumps ahead in the plan
+    ("skip_step", WHOLE),
     ("weights", SCORES),
 )
 """Constants of a kind of world: feet, quality of the sensors, and rules."""
 
 COLUMNS = ("imu_attitude", "imu_rate", "wrench", "clock", "load_share", "zmp_reference")
-"""Groups of the observation that are not of the joints."""
+"""Groups of the observation that are not the joints'."""
 
 
 @dataclass(frozen=True)
@@ -115,8 +115,8 @@ class WalkTruth:
         theta, theta_dot, q, q_dot: Motor and link side, (num_worlds, 12) [rad], [rad/s].
         pelvis: Position of the pelvis, (num_worlds, 3) [m].
         pelvis_R: Orientation of the pelvis, (num_worlds, 3, 3).
-        attitude: Its roll and pitch, (num_worlds, 2) [rad].
-        pelvis_rate: Its rate in its own frame, (num_worlds, 3) [rad/s].
+        attitude: Roll and pitch of the pelvis, (num_worlds, 2) [rad].
+        pelvis_rate: Rate of the pelvis in its own frame, (num_worlds, 3) [rad/s].
         wrench: Force and moment of the feet on the legs in the frames of the feet, (num_worlds, 2,
             2, 3) [N], [N·m].
         ankles: Positions of the ankles, (num_worlds, 2, 3) [m].
@@ -127,7 +127,7 @@ class WalkTruth:
         slope: Slope of the ground, forward and to the left, (num_worlds, 2) [rad].
         friction: True over assumed friction of the joints, (num_worlds,) [1].
         mounting: Error of roll and pitch by the IMU, (num_worlds, 2) [rad].
-        models: The true joints and masses of the worlds of each scenario, what is drawn aside.
+        models: True joints and masses of the worlds of each scenario, without drawn parameters.
     """
 
     theta: Array
@@ -150,7 +150,7 @@ class WalkTruth:
 
     @property
     def model(self) -> WalkerModel:
-        """The true joints and masses of all worlds.
+        """True joints and masses of all worlds.
 
         Raises:
             ConfigurationError: The worlds have several scenarios.
