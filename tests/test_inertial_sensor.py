@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
 from elastic_env.robots.thormang.environment import make_vector
-from elastic_env.robots.thormang.rows import TRUTH
+from elastic_env.robots.thormang.records import TRUTH
 from elastic_env.world import control_kernels as kernels
 from elastic_env.world.scenario import make_scenario
 from elastic_env.world.sensors import AttitudeSensor, InertialSensor

@@ -1,7 +1,7 @@
 """Compiled control step without the physics: command, read, measure, score, observe.
 
 One pass over the worlds, between MuJoCo's state and the observation. A world's numbers depend only
-on its own row. Records have named fields, see `elastic_env.world.rows`. The sections follow the
+on its own row. Records have named fields, see `elastic_env.world.records`. The sections follow the
 robots: joints of every robot, links on a fixed base, walkers, then the formulas that they share.
 
 Numba caches compiled code by the file of the function that was called. So this file contains
@@ -380,7 +380,7 @@ class Walker(NamedTuple):
 
     Attributes:
         constants: Addresses, feet, sensors and rules: records of `CONSTANTS`, (kinds,).
-        plan: Records of `ROW_OF_PLAN`, (steps,).
+        plan: Records of `PLAN_ROW`, (steps,).
         bias: Records of `BIAS`, drawn per episode, (num_worlds,).
         inertial: Records of `INERTIAL`, (kinds,); None where no robot has such an IMU. Its filter
             is then not compiled, which needs `inertial` as a separate argument of the functions.

@@ -25,7 +25,7 @@ from elastic_env.joint.time_step import require_stable
 from elastic_env.motion.trajectory import Motion, PlanTable
 from elastic_env.rigid.tree.end_effector import EndEffector
 from elastic_env.world import control_kernels as kernels
-from elastic_env.world import rows as records
+from elastic_env.world import records
 from elastic_env.world.drawn_robot import (
     draws_joints,
     require_bearable_friction,
@@ -38,9 +38,9 @@ from elastic_env.world.joint_config import JointConfig
 from elastic_env.world.joint_signals import joint_groups
 from elastic_env.world.metrics import Metric
 from elastic_env.world.physics import DIVERGED_RAD_S
+from elastic_env.world.records import Records, Sample, single_record
 from elastic_env.world.rest_check import RestWatch
 from elastic_env.world.robot_model import RobotModel
-from elastic_env.world.rows import Records, Sample, single_record
 from elastic_env.world.sensors import PendulumImu, is_due
 from elastic_env.world.task import Task, spring_torque
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from elastic_env.core.compiled import compiled, compiled_part
 from elastic_env.core.signals import Array, BoolArray, IntArray, Signals
-from elastic_env.world.rows import WHOLE, record_type
+from elastic_env.world.records import WHOLE, record_type
 
 Statistic: TypeAlias = Literal["rms", "peak", "min", "max", "mean", "last", "count"]
 

@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 
 from elastic_env.core.signals import Array, BoolArray, IntArray
-from elastic_env.world.rows import Records
+from elastic_env.world.records import Records
 
 _MOTION_PER_SAG = 0.004
 """Smallest motion within a window that causes a warning, over the sag [1].

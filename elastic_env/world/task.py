@@ -34,8 +34,7 @@ from elastic_env.world.joint_signals import (
 )
 from elastic_env.world.metrics import EpisodeMetrics, Metric
 from elastic_env.world.physics import DIVERGED_RAD_S, Simulation, simulate, substeps
-from elastic_env.world.robot_model import RobotModel
-from elastic_env.world.rows import (
+from elastic_env.world.records import (
     JOINT,
     RULES,
     Records,
@@ -43,6 +42,7 @@ from elastic_env.world.rows import (
     first_columns,
     joint_addresses,
 )
+from elastic_env.world.robot_model import RobotModel
 from elastic_env.world.scenario import Scenario
 from elastic_env.world.sensors import NoiseStream, angle_of_count
 from elastic_env.world.step_info import StepInfo

@@ -13,8 +13,7 @@ from elastic_env.motion import walk_plan
 from elastic_env.motion.gait import RIGHT
 from elastic_env.motion.trajectory import STAND_S
 from elastic_env.motion.walk_plan import WalkPlan
-from elastic_env.robots.thormang import rows as records
-from elastic_env.robots.thormang import tables
+from elastic_env.robots.thormang import records, tables
 from elastic_env.robots.thormang.config import (
     FALL_HEIGHT_SHARE,
     FALL_TILT_RAD,
@@ -26,8 +25,8 @@ from elastic_env.robots.thormang.config import (
 from elastic_env.robots.thormang.model import SIDES, biped
 from elastic_env.world import control_kernels as kernels
 from elastic_env.world.foot_sensors import FootSensors
+from elastic_env.world.records import Records, single_record
 from elastic_env.world.robot_model import WalkerModel
-from elastic_env.world.rows import Records, single_record
 from elastic_env.world.sensors import is_due
 
 _STEPS_BEFORE_SKIP = 2
@@ -82,10 +81,10 @@ class RobotKind:
 
 
 def plan_rows(plan: WalkPlan, config: WalkConfig) -> Records:
-    """Records of `ROW_OF_PLAN`, one per control step."""
+    """Records of `PLAN_ROW`, one per control step."""
     timing = plan.timing
     steps = np.arange(plan.num_steps + 1)
-    rows = np.zeros(len(steps), records.ROW_OF_PLAN)
+    rows = np.zeros(len(steps), records.PLAN_ROW)
     halves = np.where(timing.swing > 0.5, kernels.SECOND_HALF, kernels.FIRST_HALF)
     imu_hz = config.scenario.pelvis_imu.rate_hz
     rows["clock"] = np.column_stack([timing.time, timing.swing, timing.support])

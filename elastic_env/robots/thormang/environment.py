@@ -70,7 +70,7 @@ def configure_walk(
         )
     require_known("parameter of gait beside step_period and num_steps", gait or {}, _GAIT_FIELDS)
     thormang = as_model("robot", robot, Thormang())
-    joints = {name: as_model("joint", joint, own) for name, own in thormang.joints.items()}
+    joints = {name: as_model("joint", joint, default) for name, default in thormang.joints.items()}
     if stiffness is not None:
         joints = with_stiffness(joints, read_stiffness(stiffness))
     steps = {} if num_steps is None else {"num_steps": num_steps}

@@ -25,7 +25,7 @@ from elastic_env.rigid.leg_kinematics import foot_pose, leg_angles, rotation_z
 from elastic_env.robots.thormang import humanoid
 from elastic_env.robots.thormang.humanoid import PLAN, ZMP, ZMP_REFERENCE
 from elastic_env.robots.thormang.model import LEG_JOINTS
-from elastic_env.robots.thormang.rows import WalkTruth
+from elastic_env.robots.thormang.records import WalkTruth
 from elastic_env.robots.thormang.tables import FELL
 from elastic_env.robots.thormang.task import WalkTask
 

@@ -11,8 +11,8 @@ column per joint or component after it:
 |---|---|---|---|
 | 0 to 11 | `encoder_angle.<joint>` | rad | motor encoder, θ in whole counts |
 | 12 to 23 | `encoder_rate.<joint>` | rad/s | its change over the last control period |
-| 24, 25 | `imu_attitude.roll`, `.pitch` | rad | IMU in the pelvis; in the scenario `imu` by its own filter |
-| 26 to 28 | `imu_rate.x`, `.y`, `.z` | rad/s | its gyroscope, in the frame of the pelvis; in `imu` a period's mean |
+| 24, 25 | `imu_attitude.roll`, `.pitch` | rad | IMU in the pelvis; by its own filter in the scenario `imu` |
+| 26 to 28 | `imu_rate.x`, `.y`, `.z` | rad/s | its gyroscope, in the frame of the pelvis; the mean of a period in `imu` |
 | 29 to 31 | `wrench.l_fx`, `.l_fy`, `.l_fz` | N | left ankle sensor: force of foot on leg, in the foot's frame |
 | 32 to 34 | `wrench.l_mx`, `.l_my`, `.l_mz` | N·m | moment about the ankle, likewise |
 | 35 to 40 | `wrench.r_fx` to `.r_mz` | N, N·m | right ankle sensor |
@@ -34,7 +34,7 @@ Positions are in the plan's world frame, x forward at the start, y to the left:
 
 | key | unit | meaning |
 |---|---|---|
-| `time_s` | s | since the start of the plan, of which a walk of fewer steps leaves out strides |
+| `time_s` | s | since the start of the plan; a walk of fewer steps leaves out strides |
 | `pelvis_roll`, `pelvis_pitch` | rad | attitude of the pelvis, positive to the right and forward down |
 | `pelvis_error` | rad | angle between its z axis and the vertical, never negative |
 | `pelvis_height` | m | of the pelvis' origin |
@@ -42,9 +42,9 @@ Positions are in the plan's world frame, x forward at the start, y to the left:
 | `zmp_reference_x`, `zmp_reference_y` | m | planned |
 | `zmp_deviation` | m | distance to the plan; nan likewise |
 | `zmp_deviation_x`, `zmp_deviation_y` | m | its parts, measured − planned |
-| `foot_drift` | m | displacement of the feet against the plan, by their shares of the force; nan likewise |
+| `foot_drift` | m | displacement of the feet from the plan, weighted by their shares of the force; nan likewise |
 | `foot_drift_x`, `foot_drift_y` | m | its parts |
-| `zmp_in_feet` | m | distance of the ZMP to the plan, were the feet where they are planned; nan likewise |
+| `zmp_in_feet` | m | distance of the ZMP to the plan for feet at their planned places; nan likewise |
 | `zmp_in_feet_x`, `zmp_in_feet_y` | m | its parts, `zmp_deviation` − `foot_drift` |
 | `link_error` | rad | rms of q_ref − q over the twelve joints |
 | `link_error_lowest`, `link_error_highest` | rad | smallest and largest of them |
@@ -57,8 +57,8 @@ Positions are in the plan's world frame, x forward at the start, y to the left:
 | `swing`, `single_support` | 1 | progress of the swing; 1 where one foot carries alone, else 0 |
 | `support` | 1 | support foot of the step, 0 left, 1 right |
 | `position_error` | m | distance of the middle of the ankles from the planned one |
-| `heading_error` | rad | heading of the pelvis less the planned one, positive to the left |
-| `early_touchdown` | s | at a planned touch-down, time since the first touch in the second half of the swing; else 0 |
+| `heading_error` | rad | heading of the pelvis minus the planned one, positive to the left |
+| `early_touchdown` | s | at a planned touch-down, time since the first touch-down in the second half of the swing; else 0 |
 | `clipped` | 1 | 1 where an action was beyond its bounds |
 | `reward_terms` | 1 | weighted terms of the reward, by name |
 | `termination` | | why the episode ended: "fell", "diverged", or "" |
@@ -77,15 +77,14 @@ from elastic_env.motion import walk_plan
 from elastic_env.motion.gait import LEFT, RIGHT
 from elastic_env.motion.trajectory import Motion, Plan
 from elastic_env.motion.walk_plan import WalkPlan, plan_walk
-from elastic_env.robots.thormang import NAME, constants, tables
-from elastic_env.robots.thormang import rows as records
+from elastic_env.robots.thormang import NAME, constants, records, tables
 from elastic_env.robots.thormang.config import WalkConfig, placed_robot
 from elastic_env.robots.thormang.constants import TOUCHDOWN, RobotKind
 from elastic_env.robots.thormang.model import biped
 from elastic_env.world import control_kernels as kernels
 from elastic_env.world.foot_sensors import foot_errors
+from elastic_env.world.records import Records, Sample, first_columns
 from elastic_env.world.robot_model import WalkerModel
-from elastic_env.world.rows import Records, Sample, first_columns
 from elastic_env.world.task import Task, spring_torque
 
 

@@ -7,8 +7,8 @@ import numpy as np
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
 from elastic_env.robots.thormang.tables import GROUPS, MEASURED
+from elastic_env.world.records import COMMON_TRUTH, REAL, WHOLE, real_fields, record_type
 from elastic_env.world.robot_model import WalkerModel
-from elastic_env.world.rows import COMMON_TRUTH, REAL, WHOLE, real_fields, record_type
 
 _WRENCH_SHAPE = (2, 2, 3)  # feet, force and moment, axes
 
@@ -69,7 +69,7 @@ SCORES = record_type(*real_fields("tilt zmp zmp_in_feet foot_drift effort smooth
 WORLD = record_type(("truth", TRUTH), ("measured", MEASUREMENTS), ("scores", SCORES))
 """A control step of a world."""
 
-ROW_OF_PLAN = record_type(
+PLAN_ROW = record_type(
     *real_fields("clock", 3),  # time, swing, support
     *real_fields("share"),  # μ
     *real_fields("zmp", 2),  # [m]
