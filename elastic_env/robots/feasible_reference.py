@@ -49,10 +49,10 @@ def home_error(robot: RobotModel, body: RigidBody, home: Array) -> Configuration
     )
 
 
-def feasible_motion(
+def plan_motion(
     config: JointConfig, robot: RobotModel, body: RigidBody, workspace: Workspace
 ) -> tuple[Motion, Array]:
-    """Motion of a robot, and angles along it, (T, n) [rad].
+    """Plan the motion of a robot, and check it; also return angles along it, (T, n) [rad].
 
     Raises:
         ConfigurationError: The motion leaves the joint ranges, or needs more torque than the servos

@@ -32,7 +32,6 @@ from elastic_env.rendering.side_by_side import Alone, Sides
 from elastic_env.rigid.rigid_body import RigidBody
 from elastic_env.rigid.tree.end_effector import EndEffector
 from elastic_env.robots import deviations, feasible_reference
-from elastic_env.robots.feasible_reference import feasible_motion
 from elastic_env.world.further_sensors import ACCELEROMETER, add_accelerometer
 from elastic_env.world.joint_config import FRICTION_FIELDS, JointConfig, RewardWeights
 from elastic_env.world.joint_signals import ACTION_BOUND_RAD
@@ -150,7 +149,7 @@ class JointRobot:
                 has no place.
         """
         true, body, workspace = self._true_robot(config)
-        motion, q = feasible_motion(config, true, body, workspace)
+        motion, q = feasible_reference.plan_motion(config, true, body, workspace)
         rigid = self.rigid().compile()
         assumed = RobotModel(config.assumed_joints, rigid, config.control_period_s)
         feasible_reference.warn_of_action_bound(config, assumed, body.gravity_torque(q))
@@ -190,7 +189,7 @@ class JointRobot:
             return config
         true, body, workspace = self._true_robot(config)
         try:
-            feasible_motion(config, true, body, workspace)
+            feasible_reference.plan_motion(config, true, body, workspace)
         except arm_references.WeakServosError as error:
             weak_servos = error
         else:
@@ -205,11 +204,10 @@ class JointRobot:
                 reference=near, robot=replace(config.robot, home=home.tolist())
             )
             try:
-                feasible_motion(changed, true, body, workspace)
+                feasible_reference.plan_motion(changed, true, body, workspace)
             except arm_references.WeakServosError:
                 continue
-            old_home = config.robot.home
-            feasible_reference.warn_of_near_poses(true.joint_names, near, old_home, home)
+            feasible_reference.warn_of_near_poses(true.joint_names, near, config.robot.home, home)
             return changed
         raise weak_servos
 

@@ -315,7 +315,8 @@ class JointTask(Task):
         qpos = self.simulation.qpos
         qvel = self.simulation.qvel
         if self._imu is not None:
-            diverged = control[2] | (np.abs(qvel) > DIVERGED_RAD_S).any(axis=1)
+            is_too_fast = (np.abs(qvel) > DIVERGED_RAD_S).any(axis=1)
+            diverged = kernels.Control(*control).diverged | is_too_fast
             q_dot = qvel[:, self._addresses["q_dot"][0]]
             self._imu.advance(~diverged, qpos[:, self._addresses["q"][0]], q_dot)
         return kernels.sense_links(

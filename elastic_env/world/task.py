@@ -322,7 +322,7 @@ class Task(ABC):
 
     @abstractmethod
     def _sense_worlds(self, control: tuple[Any, ...]) -> bool:
-        """Sense, score, end and observe a control step, `kernels.Control`; True if one ends."""
+        """Sense, score, end and observe a step by parts of `kernels.Control`; True if one ends."""
 
     @abstractmethod
     def _observe_worlds(self, observation: Array) -> None:

@@ -137,9 +137,7 @@ class WalkConfig(TaskConfig):
 
     def true_model(self) -> MjModel:
         """Compile the plant without drawn parameters; a load to be drawn has no mass."""
-        spec = thormang.elastic_spec(
-            self.true_robot, self.true_joints, self.form, timestep_s=self.timestep_s
-        )
+        spec = thormang.elastic_spec(self.true_robot, self.true_joints, self.form, self.timestep_s)
         if self.scenario.places_loads:
             thormang.add_load(spec, DRAWN_LOAD, 0.0, np.zeros(3))
         for number in range(self.spare_bodies):

@@ -63,8 +63,7 @@ class RobotKind:
         period_s = config.control_period_s
         if config.true_robot != config.robot:
             plan = walk_plan.with_torque(plan, body, period_s)
-        joints = config.true_joints
-        true_model = WalkerModel(joints, body.rigid, period_s, biped=body, plan=plan)
+        true_model = WalkerModel(config.true_joints, body.rigid, period_s, biped=body, plan=plan)
         plant = copy.copy(undrawn_model(config))  # pyright: ignore[reportArgumentType]
         return RobotKind(config, bank, plant, true_model)
 

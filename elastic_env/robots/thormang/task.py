@@ -103,10 +103,9 @@ class WalkTask(Task):
             needed = f"a name, or a list with one for each world, {num_worlds}"
             raise ConfigurationError(f"scenario must be {needed}, got {len(scenarios)}")
         robot = biped(config.robot)  # pyright: ignore[reportArgumentType]  frozen models can be hashed
-        joints = config.assumed_joints
         period_s = config.control_period_s
         plan = plan_walk(config.gait, robot, period_s)  # pyright: ignore[reportArgumentType]
-        assumed = WalkerModel(joints, robot.rigid, period_s, biped=robot, plan=plan)
+        assumed = WalkerModel(config.assumed_joints, robot.rigid, period_s, biped=robot, plan=plan)
         walk_plan.require_feasible(plan, robot, assumed.servos)
         kinds = [RobotKind.of(part, plan) for part in config.scenario_configs()]
         self._variants = [(kind, *pair) for kind in kinds for pair in kind.sensor_variants]
@@ -262,8 +261,7 @@ class WalkTask(Task):
     @property
     def _walker(self) -> tuple[Any, ...]:
         """Parts of `kernels.Walker`."""
-        constant_rows = (self._walk_constants, self._plan_rows)
-        return (*constant_rows, self._bias, self._inertial, self._walk_columns)
+        return self._walk_constants, self._plan_rows, self._bias, self._inertial, self._walk_columns
 
     def _signals(self, joints: Records, worlds: Records) -> Signals:
         truth = worlds["truth"]
