@@ -23,7 +23,7 @@ def ground_wrench(feet: FootSensors, sensors: Array, foot_R: Array) -> tuple[Arr
     shown = np.array(np.broadcast_to(sensors, (*shape[:-1], 2, 3)))
     force, moment = np.empty((2, len(R), *shape[-2:]))
     for row, own in enumerate(shown.reshape(len(R), -1, 2, 3)):
-        kernels.ground_wrench(own, R[row], feet.com, feet.weight, force[row], moment[row])
+        kernels.compute_ground_wrench(own, R[row], feet.com, feet.weight, force[row], moment[row])
     return force.reshape(shape), moment.reshape(shape)
 
 
@@ -31,7 +31,7 @@ def zero_moment_point(force: Array, moment: Array, ankle: Array, least_n: float)
     """ZMP of both feet together on z = 0, (..., 2) [m]; of (..., L, 3) [N], [N·m], [m]."""
 
     def of_one(zmp: Array, *own: Array) -> None:
-        kernels.moment_point(*own, least_n, zmp)
+        kernels.compute_zmp(*own, least_n, zmp)
 
     return _of_each(of_one, 2, force, moment, ankle)
 
@@ -40,7 +40,7 @@ def foot_drift(force: Array, ankle: Array, planned: Array) -> Array:
     """Displacement of the feet that stand, (..., 2) [m]; of (..., L) [N] and (..., L, 3) [m]."""
 
     def of_one(drift: Array, force: Array, ankle: Array, planned: Array) -> None:
-        kernels.drift_of_feet(np.array(force[:, 0]), ankle, planned, drift)
+        kernels.compute_foot_drift(np.array(force[:, 0]), ankle, planned, drift)
 
     return _of_each(of_one, 2, force[..., None], ankle, planned)
 

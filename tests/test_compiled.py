@@ -255,7 +255,7 @@ def test_a_testbed_compiles_nothing_once_it_is_made(monkeypatch: pytest.MonkeyPa
     """Catches a first step, or first steps that are scored, which let a servo wait for the
     compiler."""
     used: list[Any] = []
-    names = ("command", "begin_links", "sense_links", "show_joints")
+    names = ("write_commands", "begin_links", "sense_links", "observe_all_joints")
     for name in names:
         used.append(compiled(getattr(kernels, name).py_func))
         monkeypatch.setattr(kernels, name, used[-1])
@@ -314,7 +314,7 @@ def test_a_compiled_control_step_does_what_its_python_code_says(
     compiled_ones = {
         name: function for name, function in vars(kernels).items() if hasattr(function, "py_func")
     }
-    for name in ("command", "sense_walk"):
+    for name in ("write_commands", "sense_walk"):
         monkeypatch.setattr(kernels, name, compared(compiled_ones[name]))
     for k in range(20):
         worlds.step(np.full((2, 12), 0.01 * np.sin(k), dtype=np.float32))

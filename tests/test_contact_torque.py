@@ -29,7 +29,7 @@ from elastic_env.rigid.leg_kinematics import foot_pose
 from elastic_env.robots.thormang.config import WalkConfig
 from elastic_env.robots.thormang.model import ANKLE_HEIGHT_M, LEG, LEG_JOINTS
 from elastic_env.robots.thormang.task import WalkTask
-from elastic_env.world.control_kernels import attitude_by
+from elastic_env.world.control_kernels import attitude_from_vertical
 from elastic_env.world.robot_model import WalkerModel
 from elastic_env.world.scenario import make_scenario
 from tests.trees import pendulum
@@ -325,7 +325,9 @@ def test_gravity_in_the_pelvis_is_the_turned_vertical() -> None:
     expected = R.swapaxes(-1, -2) @ [0.0, 0.0, -9.81]
     turned = [gravity_in_pelvis(*attitude, 9.81) for attitude in attitudes]
     np.testing.assert_allclose(turned, expected, rtol=0.0, atol=1e-14)
-    turned = [gravity_in_pelvis(*attitude_by(*vertical)[:2], 9.81) for vertical in R[:, 2]]
+    turned = [
+        gravity_in_pelvis(*attitude_from_vertical(*vertical)[:2], 9.81) for vertical in R[:, 2]
+    ]
     np.testing.assert_allclose(turned, expected, rtol=0.0, atol=1e-13)
 
 

@@ -224,7 +224,7 @@ def test_robots_rest_as_if_nothing_were_kept(
         assert each == [[n, -n, 0.5 * n] for n in (1.0, 2.0, 3.0, 4.0)]
         assert [rest(number) for number in range(len(robots))] == each
         assert len(calls) == len(robots)
-        monkeypatch.setattr(standing, "_calculation", lambda: ("another processor",))
+        monkeypatch.setattr(standing, "_platform", lambda: ("another processor",))
         assert rest(0) == [5.0, -5.0, 2.5]
     finally:
         placed_robot.cache_clear()

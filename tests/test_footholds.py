@@ -445,7 +445,7 @@ def test_the_picture_has_the_plans_headings() -> None:
     """Catches a pelvis or feet drawn along x, and a robot on plan that is drawn turned."""
     plan = model().plan
     for row in (0, row_of(1.0), row_of(2.4), plan.num_steps):
-        planned = Posture.of_plan(plan, row)
+        planned = Posture.from_plan(plan, row)
         np.testing.assert_allclose(planned.joint_angles(ROBOT), plan.q[row], rtol=0.0, atol=1e-9)
         drawn, factor = enlarge_posture(planned, planned, plan.share[row], ROBOT)
         assert factor > 1.0

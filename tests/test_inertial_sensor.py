@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
 from elastic_env.robots.thormang.environment import make_vector
-from elastic_env.robots.thormang.rows import TRUTH
+from elastic_env.robots.thormang.records import TRUTH
 from elastic_env.world import control_kernels as kernels
 from elastic_env.world.scenario import make_scenario
 from elastic_env.world.sensors import AttitudeSensor, InertialSensor
@@ -51,7 +51,7 @@ def test_an_acceleration_tilts_the_attitude_as_a_first_order_lag(time_s: float) 
     a = 0.5
     tau = 10.0
     up = filtered(np.array([0.0, 0.0, 1.0]), np.zeros(3), np.array([0.0, a, G]), time_s, tau)
-    roll, pitch, _ = kernels.attitude_by(*up)
+    roll, pitch, _ = kernels.attitude_from_vertical(*up)
     end = math.atan2(a, G)
     exact = end - 2.0 * math.atan(math.tan(end / 2.0) * math.exp(-time_s / tau))
     assert roll == pytest.approx(exact, rel=1e-6)
@@ -72,8 +72,8 @@ def test_a_bias_of_the_gyroscope_tilts_it_by_bias_times_time_constant(
     for time_s in (1.0, 10.0, 60.0):
         up = filtered(np.array([0.0, 0.0, 1.0]), bias, force, time_s, tau)
         expected = 1e-3 * tau * (1.0 - math.exp(-time_s / tau))
-        assert kernels.attitude_by(*up)[angle] == pytest.approx(expected, rel=1e-3)
-        assert kernels.attitude_by(*up)[1 - angle] == pytest.approx(0.0, abs=1e-9)
+        assert kernels.attitude_from_vertical(*up)[angle] == pytest.approx(expected, rel=1e-3)
+        assert kernels.attitude_from_vertical(*up)[1 - angle] == pytest.approx(0.0, abs=1e-9)
     settled = np.empty(3)
     kernels.settled_vertical(settled, force, bias, tau)
     np.testing.assert_allclose(settled, filtered(settled, bias, force, 10.0, tau), atol=5e-6)
@@ -119,7 +119,7 @@ def test_a_tilted_sensor_at_rest_feels_gravity() -> None:
     row = truth(R, np.zeros(3))
     kernels.specific_force(row, row, 0.004, G, force)
     np.testing.assert_allclose(force, R.inv().apply([0.0, 0.0, G]), atol=1e-12)
-    roll, pitch, _ = kernels.attitude_by(*(force / G))
+    roll, pitch, _ = kernels.attitude_from_vertical(*(force / G))
     assert (roll, pitch) == pytest.approx((0.3, -0.2))
 
 

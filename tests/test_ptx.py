@@ -22,9 +22,9 @@ TESTBED = "elastic_env/Testbed-v0"
 cuda: Any = importlib.import_module("numba.cuda")
 
 
-def command(step: Any, action: Any, bound: Any, is_clipped: Any, inputs: Any) -> None:
+def write_commands(step: Any, action: Any, bound: Any, is_clipped: Any, inputs: Any) -> None:
     worlds = (cuda.grid(1), cuda.gridsize(1))
-    kernels.command(step, action, bound, is_clipped, inputs, *worlds)
+    kernels.write_commands(step, action, bound, is_clipped, inputs, *worlds)
 
 
 def sense_walk(physics: Any, step: Any, walker: Any, control: Any) -> None:
@@ -37,7 +37,10 @@ def sense_links(qpos: Any, qvel: Any, step: Any, links: Any, control: Any) -> No
 
 @pytest.mark.parametrize(
     ("env", "scenario", "kernels_of_gpu"),
-    [(WALKER, "imu", (command, sense_walk)), (TESTBED, "nominal", (command, sense_links))],
+    [
+        (WALKER, "imu", (write_commands, sense_walk)),
+        (TESTBED, "nominal", (write_commands, sense_links)),
+    ],
 )
 def test_a_control_step_compiles_to_ptx(
     env: str,

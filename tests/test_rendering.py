@@ -239,7 +239,7 @@ class Walker:
     def __init__(self, walk: WalkTask) -> None:
         self.walk = walk
         self.robot = walk.truth().model.biped
-        self.planned = Posture.of_plan(walk.plan, ROW)
+        self.planned = Posture.from_plan(walk.plan, ROW)
         self.fell = False
         task: Any = SimpleNamespace(
             config=walk.config,

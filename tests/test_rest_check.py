@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from elastic_env.core.signals import Array, IntArray
+from elastic_env.world.records import JOINT, Records
 from elastic_env.world.rest_check import RestWatch
-from elastic_env.world.rows import JOINT, Records
 
 REST = np.array([-1, -1, 0, 0, 0, -1, 1, 1, 1, -1])
 IS_LAST = np.array([False] * 4 + [True] + [False] * 3 + [True, False])
@@ -30,8 +30,8 @@ def warned(q: Array, parts: list[slice]) -> list[str]:
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
         for part in parts:
-            watch.see(rest[part], is_last[part], truth[part])
-    assert watch.is_said == bool(said)
+            watch.update(rest[part], is_last[part], truth[part])
+    assert watch.has_warned == bool(said)
     return [str(one.message) for one in said]
 
 

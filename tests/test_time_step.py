@@ -71,7 +71,7 @@ def test_what_explodes_is_called_diverged_and_no_fall() -> None:
     env.reset(seed=0)
     stiffer = copy.copy(env.simulation.model)
     stiffer.tendon_stiffness[:] = 3e5
-    env.simulation.take(0, stiffer)
+    env.simulation.set_model(0, stiffer)
     for _ in range(500):
         *_, terminated, _, info = env.step(np.full(12, 0.01, dtype=np.float32))
         if terminated:

@@ -97,7 +97,7 @@ def test_the_motor_in_place_of_a_pid_moves_the_link_the_same(ki: float, aim: flo
     """Catches a gain in a wrong slot, the back-EMF left in the torque, and a torque beyond the
     servo's; both models run on MuJoCo."""
     ends = []
-    for model in (servo(ki=ki), backend().for_warp(servo(ki=ki))):
+    for model in (servo(ki=ki), backend().warp_model(servo(ki=ki))):
         data = mujoco.MjData(model)
         data.ctrl[:] = aim
         mujoco.mj_step(model, data, 400)
@@ -111,7 +111,7 @@ def test_the_integral_of_the_motor_stops_at_its_limit() -> None:
     aim = 0.5
     imax = 4e-4
     largest = []
-    for model in (servo(ki=3e4, imax=imax), backend().for_warp(servo(ki=3e4, imax=imax))):
+    for model in (servo(ki=3e4, imax=imax), backend().warp_model(servo(ki=3e4, imax=imax))):
         data = mujoco.MjData(model)
         data.ctrl[:] = aim
         acts = []
@@ -129,13 +129,13 @@ def test_servos_that_are_motors_stay_and_the_given_model_too() -> None:
     model = transform_hinges(mujoco.MjSpec.from_string(LINK), joint).compile()
     assert model.actuator_gaintype.tolist() == [int(mujoco.mjtGain.mjGAIN_DCMOTOR)]
     np.testing.assert_array_equal(
-        backend().for_warp(model).actuator_gainprm, model.actuator_gainprm
+        backend().warp_model(model).actuator_gainprm, model.actuator_gainprm
     )
     own = servo(ki=3e4)
-    backend().for_warp(own)
+    backend().warp_model(own)
     assert own.actuator_gaintype[0] == mujoco.mjtGain.mjGAIN_PID
     with pytest.raises(ConfigurationError, match="slewmax = 0, got 2 rad/s"):
-        backend().for_warp(servo(slewmax=2.0))
+        backend().warp_model(servo(slewmax=2.0))
 
 
 @pytest.mark.parametrize(
@@ -212,10 +212,10 @@ def test_every_world_can_have_its_own_model() -> None:
     heavy.tendon_stiffness[:] *= 0.5
     for worlds in pair:
         worlds.advance(1)
-        worlds.take(0, heavy)
-        worlds.take(2, heavy)
+        worlds.set_model(0, heavy)
+        worlds.set_model(2, heavy)
         worlds.advance(20)
-        worlds.take(2, worlds.model)
+        worlds.set_model(2, worlds.model)
         worlds.advance(40)
     warped, plain = pair
     np.testing.assert_allclose(warped.qpos, plain.qpos, rtol=0.0, atol=2e-5)

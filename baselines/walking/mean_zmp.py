@@ -107,7 +107,7 @@ class FlatFeet:
 def find_ground(
     feet: Any, plan: Any, observed: Any, wrench: Array, force: Array, error: Array
 ) -> None:
-    """`FlatFeet.ground`, by the equation of `moment_point` in the control kernels.
+    """`FlatFeet.ground`, by the equation of `compute_zmp` in the control kernels.
 
     Args:
         feet: Feet of the walker, a row, (1,).

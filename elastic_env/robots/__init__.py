@@ -1,1 +1,1 @@
-"""Robots as MuJoCo specifications, and the transform that makes their hinges elastic."""
+"""Robots as MuJoCo specifications, with their tasks, environments and pictures."""

@@ -1,4 +1,4 @@
-"""Deviations of joints from their reference, as pictures of fixed robots draw them: enlarged."""
+"""Enlarged deviations of joints from their reference, in pictures of robots on a fixed base."""
 
 from typing import Any
 
@@ -11,16 +11,16 @@ ENLARGEMENT = 8.0
 """Factor by which deviations from the reference are enlarged."""
 REFERENCE_RGBA = (0.35, 0.65, 0.45, 0.35)
 REFERENCE_WORD_RGBA = (0.27, 0.55, 0.37, 1.0)
-"""Colour of the translucent reference, and of its word in the legend."""
+"""Colours of the translucent reference, and of its word in the legend."""
 
 
 def enlarge_deviation(angle: Any, reference: Any, factor: float = ENLARGEMENT) -> Any:
-    """Angle at which something is drawn, its deviation from the reference enlarged [rad]."""
+    """Angle for a picture, with its deviation from the reference enlarged [rad]."""
     return reference + factor * (angle - reference)
 
 
 class DeviationPicture(Picture):
-    """A picture of a robot on a fixed base that says by how much its deviations are enlarged."""
+    """A picture of a robot on a fixed base, whose caption gives the factor of its deviations."""
 
     def _caption(self, now: dict[str, float], world: int) -> list[str]:  # noqa: ARG002
         deflection = 1e3 * now["deflection"]

@@ -1,12 +1,12 @@
-"""Known robots on a fixed base, all of whose hinges are made elastic.
+"""Known robots on a fixed base, whose hinges all become elastic.
 
     spec = gallery_robot("panda")
     model = make_elastic(spec, gallery_joints("panda")).compile()
 
-The arms are those of the package `example-robot-data` (extra `robots`); the pusher comes with
-Gymnasium. Slides, such as fingers of grippers, are held where the model has them. Nobody publishes
-stiffness, damping and rotor inertia of these joints in a form that we could check. They are
-therefore assumed, by the rule of `assumed_joints`.
+The arms come from the package `example-robot-data` (extra `robots`), the pusher from Gymnasium.
+Slides, such as fingers of grippers, are fixed at their position in the model. No published
+stiffness, damping or rotor inertia of these joints can be checked. They are therefore assumed, by
+the rule of `assumed_joints`.
 """
 
 from collections.abc import Mapping, Sequence
@@ -30,51 +30,48 @@ from elastic_env.rigid.rigid_body import RigidBody
 TIMESTEP_S = 1e-3
 """Physics step of all robots, with the integrator `implicitfast` [s]."""
 SAG_RAD = 0.015
-"""Deflection of a joint under the largest torque of its robot's weight, which the assumed
-stiffness gives.
-"""
+"""Assumed deflection of a joint under the largest torque of its robot's weight [rad]."""
 _PACKAGE = "example-robot-data"
-_SHARE = "cmeel.prefix/share/example-robot-data/robots"
-_WEAKEST = 0.05
-_SLOWEST = 2.0 * np.pi * 5.0
-"""Least stiffness of a joint: over that which the largest torque asks for, and by its frequency
-[rad/s].
-"""
-_ROTOR = 0.5
-_LIGHTEST = 0.01
+_ROBOTS_FOLDER = "cmeel.prefix/share/example-robot-data/robots"
+_LEAST_TORQUE_SHARE = 0.05
+"""Least torque that the stiffness of a joint is designed for, over the largest torque [1]."""
+_LEAST_FREQUENCY_RAD_S = 2.0 * np.pi * 5.0
+"""Least frequency of the links on a joint's spring [rad/s]."""
+_ROTOR_SHARE = 0.5
+"""Rotor inertia over the inertia of the joint's links [1]."""
+_LEAST_ROTOR_SHARE = 0.01
+"""Part of the rotor inertia over the largest inertia of links [1]."""
 _DAMPING_RATIO = 0.1
-_SERVO_RATE = 20.0
-"""Rotor inertia over that of the joint's links, least one over the largest; damping ratio;
-servo's rate [rad/s].
-"""
+_SERVO_RATE_RAD_S = 20.0
+"""Rate of the servos' three poles [rad/s]."""
 _POSES = 50
-_INNER = 0.8
-_FARTHEST = np.pi
-"""Number of random poses, the part of a joint's range that they use, and their largest angle
-[rad].
-"""
+"""Number of random poses."""
+_RANGE_SHARE = 0.8
+"""Share of a joint's range in random poses [1]."""
+_LARGEST_ANGLE_RAD = np.pi
+"""Largest angle in random poses [rad]."""
 
 
 class GalleryRobot(Model):
     """A robot of the gallery."""
 
     title: str
-    """Its name in full."""
+    """Full name of the robot."""
     file: str
-    """Where its model lies, in the package or among Gymnasium's."""
+    """Path of the model, in the package or among Gymnasium's models."""
     end_effector: str
-    """Body that is to be placed."""
+    """Body of the end effector."""
     home: dict[str, float] = {}
-    """Angles that differ from zero in the pose about which it moves, by joint [rad]."""
+    """Nonzero angles of the pose about which it moves, by joint [rad]."""
     licence: str = "BSD"
-    """Licence of its model."""
+    """Licence of the model."""
     tip: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Which point of the end effector is to be placed, in its frame [m]."""
+    """Point of the end effector that is positioned, in its frame [m]."""
 
 
 GALLERY: Mapping[str, GalleryRobot] = {
-    name: GalleryRobot(**own)
-    for name, own in read_mapping(Path(__file__).with_suffix(".yaml")).items()
+    name: GalleryRobot(**fields)
+    for name, fields in read_mapping(Path(__file__).with_suffix(".yaml")).items()
 }
 """The robots by name."""
 
@@ -83,8 +80,8 @@ def gallery_file(name: str, folder: Path | None = None) -> Path:
     """File of a robot's model.
 
     Args:
-        name: As in `GALLERY`.
-        folder: Folder of the robots in place of that of the package.
+        name: Name in `GALLERY`.
+        folder: Folder of the robots; default the package's.
 
     Raises:
         ConfigurationError: No such robot, or the package is missing.
@@ -96,23 +93,22 @@ def gallery_file(name: str, folder: Path | None = None) -> Path:
         return assets / file.name
     robot = f"the robot {name!r}"
     try:
-        path = (folder or Path(str(distribution(_PACKAGE).locate_file(_SHARE)))) / file
+        path = (folder or Path(str(distribution(_PACKAGE).locate_file(_ROBOTS_FOLDER)))) / file
     except PackageNotFoundError:
         raise missing_extra(_PACKAGE, "robots", robot) from None
     if not path.is_file():
-        where = f"which has no model at {path},"
-        raise missing_extra(_PACKAGE, "robots", f"{robot}, {where}")
+        raise missing_extra(_PACKAGE, "robots", f"{robot}, which has no model at {path},")
     return path
 
 
 def gallery_robot(name: str, folder: Path | None = None, shapes: bool = False) -> MjSpec:
-    """Rigid specification of a robot, whose slides are held.
+    """Rigid specification of a robot, whose slides are fixed.
 
     Args:
-        name: As in `GALLERY`.
-        folder: Folder of the robots in place of that of the package.
-        shapes: Whether to load the meshes that MuJoCo reads, for pictures. They have no mass and
-            touch nothing.
+        name: Name in `GALLERY`.
+        folder: Folder of the robots; default the package's.
+        shapes: True to load meshes that MuJoCo can read, for pictures. They have no mass and no
+            contacts.
 
     Raises:
         ConfigurationError: No such robot, or the package is missing.
@@ -127,10 +123,10 @@ def gallery_robot(name: str, folder: Path | None = None, shapes: bool = False) -
     spec.option.gravity = [0.0, 0.0, -9.81]
     slide = mujoco.mjtJoint.mjJNT_SLIDE
     slides = [joint for joint in spec.joints if joint.type == slide]
-    held = {joint.name for joint in slides}
-    # a finger that copies the other
-    ties = [tie for tie in spec.equalities if held & {tie.name1, tie.name2}]
-    # the servos of the elastic joints take the place of actuators
+    slide_names = {joint.name for joint in slides}
+    # constraints of a finger that follows the other one
+    ties = [tie for tie in spec.equalities if slide_names & {tie.name1, tie.name2}]
+    # the servos of the elastic joints replace the actuators
     for element in (*ties, *slides, *spec.actuators):
         spec.delete(element)
     return spec
@@ -142,17 +138,17 @@ def home_pose(name: str, joints: Sequence[str]) -> Array:
 
 
 def random_poses(model: MjModel, generator: np.random.Generator, number: int = _POSES) -> Array:
-    """Poses within the inner part of the joints' ranges, (number, n) [rad].
+    """Draw poses within the inner part of the joints' ranges, (number, n) [rad].
 
-    The robot may cross itself in them.
+    The robot may collide with itself in these poses.
     """
     ids = [int(model.joint(name).id) for name in hinges_of(model)]
     limited = model.jnt_limited[ids, None].astype(bool)
-    ranges = np.where(limited, model.jnt_range[ids], [-_FARTHEST, _FARTHEST])
-    ends = np.clip(ranges, -_FARTHEST, _FARTHEST)
-    # of a range that lies beyond a half turn, such as Kinova's 47° to 313°, what is within it
+    ranges = np.where(limited, model.jnt_range[ids], [-_LARGEST_ANGLE_RAD, _LARGEST_ANGLE_RAD])
+    # a range beyond half a turn, such as Kinova's 47° to 313°, is cut off there
+    ends = np.clip(ranges, -_LARGEST_ANGLE_RAD, _LARGEST_ANGLE_RAD)
     middle = ends.mean(axis=1)
-    half = _INNER * np.ptp(ends, axis=1) / 2.0
+    half = _RANGE_SHARE * np.ptp(ends, axis=1) / 2.0
     return generator.uniform(middle - half, middle + half, (number, len(ids)))
 
 
@@ -163,35 +159,34 @@ def gallery_joints(name: str, folder: Path | None = None) -> dict[str, ElasticJo
 
 
 def assumed_joints(model: MjModel) -> dict[str, ElasticJoint]:
-    r"""Elastic joints by one rule for all robots, for want of measured ones.
+    r"""Make elastic joints by one rule for all robots, because measured values are missing.
 
     .. math::
         K_j = \max\left(\frac{\tau_j}{0.015}, \frac{\max_i \tau_i}{20 \cdot 0.015}, (10 \pi)^2 M_j\right), \quad
         B_j = \frac{M_j}{2} + \frac{\max_i M_i}{100}, \quad D_j = 0.2 \sqrt{K_j m_j}
 
     τ_j is the largest gravity torque over random poses, M_j the largest inertia about the joint.
-    0.015 rad is a sag that users of arms report, 10π rad/s a frequency that keeps a vertical axis,
-    which carries no weight, from swinging. m_j is the inertia against which the spring swings: that
-    of the rotor and the least one of its links while the other joints are free. Two digits of K are
-    kept.
+    Users of arms report a sag of 0.015 rad. A frequency of 10π rad/s prevents slow oscillations of
+    a vertical axis, which carries no weight. m_j is the inertia on the spring: rotor in series with
+    the least inertia of the links while the other joints are free. K is rounded to two digits.
 
     Args:
-        model: Compiled rigid model, all of whose joints are hinges.
+        model: Compiled rigid model; all of its joints are hinges.
 
     Returns:
-        Joints by name, with a servo that holds its angle.
+        Joints by name, with servos that hold their angles.
     """  # noqa: E501
     names = hinges_of(model)
     poses = random_poses(model, np.random.default_rng(0))
     torque = np.abs(RigidBody(model, names).gravity_torque(poses)).max(axis=0)
-    inertia = np.array([_inertia(model, pose) for pose in poses])
+    inertia = np.array([_mass_matrix(model, pose) for pose in poses])
     links = np.diagonal(inertia, axis1=1, axis2=2).max(axis=0)
     free = (1.0 / np.diagonal(np.linalg.inv(inertia), axis1=1, axis2=2)).min(axis=0)
-    carried = np.maximum(torque, _WEAKEST * torque.max())
-    stiffness = np.maximum(carried / SAG_RAD, _SLOWEST**2 * links)
+    carried = np.maximum(torque, _LEAST_TORQUE_SHARE * torque.max())
+    stiffness = np.maximum(carried / SAG_RAD, _LEAST_FREQUENCY_RAD_S**2 * links)
     digit = 10.0 ** (np.floor(np.log10(stiffness)) - 1.0)
     stiffness = np.round(stiffness / digit) * digit
-    rotor = _ROTOR * links + _LIGHTEST * links.max()
+    rotor = _ROTOR_SHARE * links + _LEAST_ROTOR_SHARE * links.max()
     damping = 2.0 * _DAMPING_RATIO * np.sqrt(stiffness / (1.0 / rotor + 1.0 / free))
     joints: dict[str, ElasticJoint] = {}
     for j, name in enumerate(names):
@@ -207,21 +202,22 @@ def assumed_joints(model: MjModel) -> dict[str, ElasticJoint]:
 
 
 def _servo(inertia: float, stiffness: float, torque_limit: float) -> Servo:
-    """A servo that holds its angle, no softer than the spring behind it.
+    """Make a servo that holds its angle and is no softer than its spring.
 
-    It gives a rigid load three equal poles.
+    With a rigid load it has three equal poles.
     """
-    carried = max(inertia, stiffness / (3.0 * _SERVO_RATE**2))
+    rate = _SERVO_RATE_RAD_S
+    load_inertia = max(inertia, stiffness / (3.0 * rate**2))
     return Servo(
-        position_gain=3.0 * carried * _SERVO_RATE**2,
-        velocity_gain=3.0 * carried * _SERVO_RATE,
-        integral_gain=carried * _SERVO_RATE**3,
+        position_gain=3.0 * load_inertia * rate**2,
+        velocity_gain=3.0 * load_inertia * rate,
+        integral_gain=load_inertia * rate**3,
         torque_limit=torque_limit,
         speed_limit=5.0,
     )
 
 
-def _inertia(model: MjModel, pose: Array) -> Array:
+def _mass_matrix(model: MjModel, pose: Array) -> Array:
     """Mass matrix without armature, (n, n) [kg·m²]."""
     data = mujoco.MjData(model)
     data.qpos[:] = pose

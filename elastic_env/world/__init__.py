@@ -1,1 +1,1 @@
-"""Worlds in time: physics, sensors, scenarios, episodes, metrics, and their Gymnasium faces."""
+"""Simulated worlds: physics, sensors, scenarios, episodes, metrics, Gymnasium environments."""

@@ -1,14 +1,14 @@
-"""A control step but for the physics, compiled: command, read, measure, score, observe.
+"""Compiled control step without the physics: command, read, measure, score, observe.
 
-One pass over the worlds, between MuJoCo's state and the observation. A world's numbers depend on
-its own row alone. Records have their fields by name, see `elastic_env.world.rows`. All robots share
-the joints. What comes on top stands behind them: links on a fixed base, and a walker.
+One pass over the worlds, between MuJoCo's state and the observation. A world's numbers depend only
+on its own row. Records have named fields, see `elastic_env.world.records`. The sections follow the
+robots: joints of every robot, links on a fixed base, walkers, then the formulas that they share.
 
-Numba keeps compiled code by the file of the function that was called. So everything that a kernel
-calls stands in this file, and every size comes from a type or from an array. A kernel that Python
-calls takes plain tuples and names their parts itself: Numba takes a microsecond more for a tuple
-with names. The control step compiles for a GPU too, see `tests.ptx`. So its functions return no
-part of an array, and what they allocate has a constant shape.
+Numba caches compiled code by the file of the function that was called. So this file contains
+everything that a kernel calls, and every size comes from a type or from an array. A kernel that
+Python calls takes plain tuples and names their parts itself: a named tuple costs Numba a
+microsecond more. The control step compiles for a GPU too, see `tests.ptx`. So its functions return
+no part of an array, and they allocate only constant shapes.
 """
 
 import math
@@ -21,33 +21,36 @@ from elastic_env.core.signals import Array, BoolArray, IntArray, Parameter
 
 FIRST_HALF = 1
 SECOND_HALF = 2
-"""Of a swing; 0 is none."""
+"""Halves of a swing; 0 means that no foot swings."""
 EVERY_WORLD = (0, 1)
-"""First world of a call, and from one of its worlds to the next; a thread of a GPU has others."""
+"""Arguments `first` and `stride` of a kernel that visits all worlds; a GPU's thread has others."""
+
+
+# arguments of kernels
 
 
 class Step(NamedTuple):
-    """Joints and worlds in a control step: constants within an episode, and records.
+    """Joints and worlds in a control step: records, and constants of an episode.
 
     Attributes:
-        last_joints, joints: Records of the step before, and of the present one, which is filled,
-            (num_worlds, n).
-        last_worlds, worlds: The same of the worlds, (num_worlds,).
-        at: Where the joints stand in the physics, (n,).
-        columns: Where they stand in the observation, (1,).
+        last_joints, joints: Records of the last step and of the present one, (num_worlds, n). The
+            kernels fill the present one.
+        last_worlds, worlds: The same for the worlds, (num_worlds,).
+        addresses: Records of `ADDRESS`: indices of the joints in the physics, (n,).
+        columns: First column of each group of the observation, (1,).
         plans: Angle, rate and acceleration of the reference at every step, (plans, steps, 3, n).
-        plan: Which of the plans each world follows, (num_worlds,).
+        plan: Index of the plan of each world, (num_worlds,).
         rules: Records of `RULES`, (kinds,).
-        kind: Which of the rules, and of all other constants, hold in each world, (num_worlds,).
-        samples: Standard normal samples ahead, (block, num_worlds).
-        used: How many of each world's are used, (num_worlds,).
+        kind: Index of the rules, and of all other constants, of each world, (num_worlds,).
+        samples: Standard normal samples, (block, num_worlds).
+        used: Number of used samples of each world, (num_worlds,).
     """
 
     last_joints: Any
     joints: Any
     last_worlds: Any
     worlds: Any
-    at: Any
+    addresses: Any
     columns: Any
     plans: Array
     plan: IntArray
@@ -58,37 +61,40 @@ class Step(NamedTuple):
 
 
 @compiled_part
-def step_of(joints: Any, worlds: Any, row: int, *constants: Any) -> Step:
-    """The step of a row of blocks of joints, (steps, num_worlds, n), and of worlds."""
+def step_at(joints: Any, worlds: Any, row: int, *constants: Any) -> Step:
+    """Return the step at a row of the blocks of joints, (steps, num_worlds, n), and of worlds."""
     return Step(joints[row - 1], joints[row], worlds[row - 1], worlds[row], *constants)
 
 
 class Control(NamedTuple):
-    """Commands of the control step that has gone by, and arrays that it fills.
+    """Commands of the last control period, and arrays that the kernels fill.
 
     Attributes:
-        offset: Within their bounds, (num_worlds, n) [rad].
+        offset: Command offsets within their bounds, (num_worlds, n) [rad].
         is_clipped: Worlds whose action was beyond its bounds.
-        diverged: Worlds that diverged, to which those too fast are added. They keep truth and
-            measurements.
-        periods: Control periods that have gone by, more than 1 where hardware has missed some.
-        observed: Observation, (num_worlds, columns).
-        reward: (num_worlds,).
-        ends: Whether a world diverged, failed in other ways, is terminated, is truncated, (ways,
-            num_worlds).
+        diverged: Worlds that diverged; the kernels add worlds that are too fast. They keep truth
+            and measurements of the last step.
+        periods: Elapsed control periods; more than 1 where hardware has missed some.
+        observation: Observation, (num_worlds, columns).
+        reward: Reward, (num_worlds,).
+        ends: True where a world diverged, failed in another way, is terminated, is truncated,
+            (ways, num_worlds).
     """
 
     offset: Array
     is_clipped: BoolArray
     diverged: BoolArray
     periods: float
-    observed: Array
+    observation: Array
     reward: Array
     ends: BoolArray
 
 
+# joints of every robot
+
+
 @compiled
-def command(
+def write_commands(
     step: Any,
     action: Array,
     bound: Array,
@@ -97,30 +103,28 @@ def command(
     first: int,
     stride: int,
 ) -> bool:
-    """Servo inputs of the coming control period, q_ref + offset.
-
-    Encoders are off by their homing error.
+    """Write the servo inputs of the coming control period: q_ref + offset − homing error.
 
     Args:
         step: The present `Step`.
-        action: Offsets, (num_worlds, n) [rad], which are brought within their bounds.
-        bound: Of every joint [rad].
-        is_clipped: To be filled: worlds with an action beyond its bounds.
-        inputs: To be filled [rad].
-        first: World that it begins with.
-        stride: From one of its worlds to the next, see `EVERY_WORLD`.
+        action: Offsets, (num_worlds, n) [rad]; they are clipped in place.
+        bound: Largest offset of every joint [rad].
+        is_clipped: Output: worlds with an action beyond its bounds.
+        inputs: Output: servo inputs [rad].
+        first: First world.
+        stride: Distance to the next world, see `EVERY_WORLD`.
 
     Returns:
-        Whether all offsets are finite; if not, no input is written.
+        True if all offsets are finite; otherwise no input is written.
     """
-    step = step_of(*step)
+    step = step_at(*step)
     for world in range(first, len(action), stride):
         for i in range(len(bound)):
             if not np.isfinite(action[world, i]):
                 return False
     for world in range(first, len(action), stride):
         is_clipped[world] = False
-        coming = step.plans[coming_motion(step, world)]
+        coming = step.plans[coming_reference(step, world)]
         for i in range(len(bound)):
             value = action[world, i]
             offset = min(max(value, -bound[i]), bound[i])
@@ -128,114 +132,114 @@ def command(
                 is_clipped[world] = True
             action[world, i] = offset
             homing = step.joints[world, i].truth.homing
-            inputs[world, step.at[i].servo] = coming[0, i] + offset - homing
+            inputs[world, step.addresses[i].servo] = coming[0, i] + offset - homing
     return True
 
 
 @compiled_part
-def coming_motion(step: Step, world: int) -> tuple[int, int]:
-    """Which plan the reference at the end of the coming period is of, and which row of it."""
+def coming_reference(step: Step, world: int) -> tuple[int, int]:
+    """Index of the reference at the end of the coming period: plan and row."""
     coming = step.worlds[world].truth.step + 1
     return step.plan[world], min(coming, step.plans.shape[1] - 1)
 
 
 @compiled_part
 def begin_joints(qpos: Array, qvel: Array, step: Step, world: int) -> None:
-    """Truth and measurements of joints that have been at rest at the start of an episode."""
-    course = step.worlds[world].truth
-    course.step = 0
-    course.command_rate = 0.0
-    course.clipped = False
-    course.diverged = False
+    """Fill truth and measurements of resting joints at the start of an episode."""
+    world_truth = step.worlds[world].truth
+    world_truth.step = 0
+    world_truth.command_rate = 0.0
+    world_truth.clipped = False
+    world_truth.diverged = False
     count_rad = step.rules[step.kind[world]].count_rad
     plan = step.plans[step.plan[world]]
-    for i in range(len(step.at)):
+    for i in range(len(step.addresses)):
         joint = step.joints[world, i]
         joint.truth.q_ref = plan[0, 0, i]
         joint.truth.command = plan[0, 0, i]
         joint.truth.offset = 0.0
         joint.truth.command_rate = 0.0
-        read_joint(qpos[world], qvel[world], step.at[i], joint, count_rad)
-        joint.shown.encoder_before = joint.shown.encoder
+        read_joint(qpos[world], qvel[world], step.addresses[i], joint, count_rad)
+        joint.measured.last_encoder = joint.measured.encoder
 
 
 @compiled_part
 def sense_joints(
     qpos: Array, qvel: Array, step: Step, control: Control, first: int, stride: int
 ) -> None:
-    """Joints after the physics of a control step: keep the command, read, measure, observe."""
+    """Process the joints after the physics: store the command, read, measure, observe."""
     offset = control.offset
     diverged = control.diverged
-    n = len(step.at)
+    n = len(step.addresses)
     for world in range(first, len(offset), stride):
         rules = step.rules[step.kind[world]]
         plan = step.plans[step.plan[world]]
         step.worlds[world] = step.last_worlds[world]
-        course = step.worlds[world].truth
-        course.step += 1
-        course.clipped = control.is_clipped[world]
+        world_truth = step.worlds[world].truth
+        world_truth.step += 1
+        world_truth.clipped = control.is_clipped[world]
         total = 0.0
         for i in range(n):
             step.joints[world, i] = step.last_joints[world, i]
             truth = step.joints[world, i].truth
-            truth.q_ref = plan[min(course.step, len(plan) - 1), 0, i]
+            truth.q_ref = plan[min(world_truth.step, len(plan) - 1), 0, i]
             change = offset[world, i] - truth.offset
             truth.offset = offset[world, i]
             truth.command = truth.q_ref + truth.offset
             truth.command_rate = change / rules.control_period_s
             total += change * change
-            motor = abs(qvel[world, step.at[i].theta_dot])
-            fastest = max(motor, abs(qvel[world, step.at[i].q_dot]))
+            motor = abs(qvel[world, step.addresses[i].theta_dot])
+            fastest = max(motor, abs(qvel[world, step.addresses[i].q_dot]))
             diverged[world] = diverged[world] or fastest > rules.highest_rad_s
-        course.command_rate = math.sqrt(total / n) / rules.control_period_s
-        course.diverged = diverged[world]
+        world_truth.command_rate = math.sqrt(total / n) / rules.control_period_s
+        world_truth.diverged = diverged[world]
         if not diverged[world]:
             for i in range(n):
                 joint = step.joints[world, i]
-                joint.shown.encoder_before = joint.shown.encoder
-                read_joint(qpos[world], qvel[world], step.at[i], joint, rules.count_rad)
-        observe_joints(step, world, control.periods, control.observed[world])
+                joint.measured.last_encoder = joint.measured.encoder
+                read_joint(qpos[world], qvel[world], step.addresses[i], joint, rules.count_rad)
+        observe_joints(step, world, control.periods, control.observation[world])
 
 
 @compiled
-def show_joints(step: Any, observed: Array) -> None:
-    """The joints' columns of observations of the present state."""
-    step = step_of(*step)
-    for world in range(len(observed)):
-        observe_joints(step, world, 1.0, observed[world])
+def observe_all_joints(step: Any, observation: Array) -> None:
+    """Fill the joints' columns of all observations from the present state."""
+    step = step_at(*step)
+    for world in range(len(observation)):
+        observe_joints(step, world, 1.0, observation[world])
 
 
 @compiled_part
-def read_joint(qpos: Array, qvel: Array, at: Any, joint: Any, count_rad: float) -> None:
-    """State of a joint as the physics has it, and the motor's angle by its encoder."""
-    truth = joint.truth
-    truth.theta = qpos[at.theta]
-    truth.theta_dot = qvel[at.theta_dot]
-    truth.q = qpos[at.q]
-    truth.q_dot = qvel[at.q_dot]
-    angle = truth.theta + truth.homing
-    joint.shown.encoder = angle
-    if count_rad > 0.0:
-        joint.shown.encoder = in_whole_counts(angle, count_rad)
-
-
-@compiled_part
-def observe_joints(step: Step, world: int, periods: float, observed: Array) -> None:
-    """Fill the joints' columns of an observation, the coming reference among them."""
+def observe_joints(step: Step, world: int, periods: float, observation: Array) -> None:
+    """Fill the joints' columns of an observation, including the coming reference."""
     rules = step.rules[step.kind[world]]
     visible = step.last_joints[world] if rules.is_delayed else step.joints[world]
     period_s = rules.control_period_s * periods
-    coming = step.plans[coming_motion(step, world)]
+    coming = step.plans[coming_reference(step, world)]
     columns = step.columns[0]
-    for i in range(len(step.at)):
-        shown = visible[i].shown
-        observed[columns.encoder_angle + i] = shown.encoder
-        change = shown.encoder - shown.encoder_before
-        observed[columns.encoder_rate + i] = change / period_s
-        observed[columns.reference_angle + i] = coming[0, i]
-        observed[columns.reference_rate + i] = coming[1, i]
-        observed[columns.reference_acceleration + i] = coming[2, i]
-        observed[columns.last_command + i] = step.joints[world, i].truth.command
+    for i in range(len(step.addresses)):
+        measured = visible[i].measured
+        observation[columns.encoder_angle + i] = measured.encoder
+        change = measured.encoder - measured.last_encoder
+        observation[columns.encoder_rate + i] = change / period_s
+        observation[columns.reference_angle + i] = coming[0, i]
+        observation[columns.reference_rate + i] = coming[1, i]
+        observation[columns.reference_acceleration + i] = coming[2, i]
+        observation[columns.last_command + i] = step.joints[world, i].truth.command
+
+
+@compiled_part
+def read_joint(qpos: Array, qvel: Array, address: Any, joint: Any, count_rad: float) -> None:
+    """Copy the state of a joint from the physics, and measure the motor's angle by its encoder."""
+    truth = joint.truth
+    truth.theta = qpos[address.theta]
+    truth.theta_dot = qvel[address.theta_dot]
+    truth.q = qpos[address.q]
+    truth.q_dot = qvel[address.q_dot]
+    angle = truth.theta + truth.homing
+    joint.measured.encoder = angle
+    if count_rad > 0.0:
+        joint.measured.encoder = round_to_counts(angle, count_rad)
 
 
 # links on a fixed base
@@ -245,12 +249,12 @@ class Links(NamedTuple):
     """Constants of links on a fixed base.
 
     Attributes:
-        schedule: What the reference says of every step, (steps,).
+        schedule: Records of `SCHEDULE`, (steps,).
         constants: Weights of the reward and quality of the IMU, (1,).
         imu_bias: Offset of the IMU on the only link, (num_worlds,) [rad].
-        imu_column: Where it is observed, −1 for nowhere.
-        imu_angle: Angle of the link as an inertial IMU computes it, (num_worlds,) [rad]; None for
-            one that shows the true angle with its errors.
+        imu_column: Column of the IMU in the observation; −1 if it is not observed.
+        imu_angle: Link angle by an inertial IMU, (num_worlds,) [rad]; None for an IMU that
+            measures the true angle with errors.
     """
 
     schedule: Any
@@ -262,21 +266,18 @@ class Links(NamedTuple):
 
 @compiled
 def begin_links(qpos: Array, qvel: Array, step: Any, links: Any, worlds: BoolArray) -> None:
-    """Truth and measurements of links at the start of an episode in some worlds.
-
-    The links have been at rest.
-    """
-    step = step_of(*step)
+    """Fill truth and measurements of resting links at the start of an episode in some worlds."""
+    step = step_at(*step)
     links = Links(*links)
     for world in range(len(worlds)):
         if worlds[world]:
             begin_joints(qpos, qvel, step, world)
             truth = step.worlds[world].truth
-            shown = step.worlds[world].shown
+            measured = step.worlds[world].measured
             truth.scored = links.schedule[0].scored
             truth.rest = links.schedule[0].rest
-            show_link(links.imu_angle, links, step, world)
-            shown.visible_imu = shown.imu
+            sample_link_imu(links.imu_angle, links, step, world)
+            measured.visible_imu = measured.imu
 
 
 @compiled
@@ -289,21 +290,21 @@ def sense_links(
     first: int,
     stride: int,
 ) -> bool:
-    """Everything after the physics where the base is fixed: read, measure, end, score, observe.
+    """Process links on a fixed base after the physics: read, measure, end, score, observe.
 
     Args:
         qpos: Positions of all worlds.
-        qvel: And speeds.
+        qvel: Speeds of all worlds.
         step: `Step`.
         links: `Links`.
         control: `Control`.
-        first: World that it begins with.
-        stride: From one of its worlds to the next, see `EVERY_WORLD`.
+        first: First world.
+        stride: Distance to the next world, see `EVERY_WORLD`.
 
     Returns:
-        Whether an episode ends.
+        True if an episode ends.
     """
-    step = step_of(*step)
+    step = step_at(*step)
     links = Links(*links)
     control = Control(*control)
     sense_joints(qpos, qvel, step, control, first, stride)
@@ -311,31 +312,31 @@ def sense_links(
     is_over = False
     for world in range(first, len(diverged), stride):
         truth = step.worlds[world].truth
-        shown = step.worlds[world].shown
+        measured = step.worlds[world].measured
         scores = step.worlds[world].scores
         last = len(links.schedule) - 1
         planned = links.schedule[min(truth.step, last)]
         truth.scored = planned.scored
         truth.rest = planned.rest
         if planned.imu_is_due and not diverged[world]:
-            show_link(links.imu_angle, links, step, world)
+            sample_link_imu(links.imu_angle, links, step, world)
         is_delayed = step.rules[step.kind[world]].is_delayed
-        shown.visible_imu = shown.imu
+        measured.visible_imu = measured.imu
         if is_delayed:
-            shown.visible_imu = step.last_worlds[world].shown.imu
+            measured.visible_imu = step.last_worlds[world].measured.imu
         if links.imu_column >= 0:
-            control.observed[world, links.imu_column] = shown.visible_imu
+            control.observation[world, links.imu_column] = measured.visible_imu
         ends = control.ends[:, world]
         ends[0] = ends[1] = diverged[world]
         ends[2] = truth.step >= last and not diverged[world]
         is_over = is_over or ends[0] or ends[2]
         total = 0.0
-        for i in range(len(step.at)):
+        for i in range(len(step.addresses)):
             error = step.joints[world, i].truth.q_ref - step.joints[world, i].truth.q
             total += error * error
-        # of penalties that grow without saturating
+        # penalties that grow without saturating
         weights = links.constants[0].weights
-        scores.link_error = weights.link_error * -math.sqrt(total / len(step.at))
+        scores.link_error = weights.link_error * -math.sqrt(total / len(step.addresses))
         scores.command_rate = weights.command_rate * -truth.command_rate
         scores.divergence = weights.divergence * (-1.0 if diverged[world] else -0.0)
         reward = scores.link_error + scores.command_rate + scores.divergence
@@ -344,19 +345,19 @@ def sense_links(
 
 
 @compiled_part
-def show_link(imu_angle: Any, links: Links, step: Step, world: int) -> None:
-    """The next sample of the IMU on the only link, see `Links`."""
+def sample_link_imu(imu_angle: Any, links: Links, step: Step, world: int) -> None:
+    """Take the next sample of the IMU on the only link, see `Links`."""
     quality = links.constants[0]
-    drawn = sample_of(step, world)
+    sample = next_noise(step, world)
     if imu_angle is None:
         angle = step.joints[world, 0].truth.q
-        added = quality.imu_noise_rad * drawn.imu
+        noise = quality.imu_noise_rad * sample.imu
     else:
         angle = imu_angle[world]
-        added = 0.0
+        noise = 0.0
     bias = links.imu_bias[world]
-    step.worlds[world].shown.imu = shown_angle(
-        angle, bias, added, quality.imu_bias_rad, quality.imu_sine_error_rad
+    step.worlds[world].measured.imu = measured_angle(
+        angle, bias, noise, quality.imu_bias_rad, quality.imu_sine_error_rad
     )
 
 
@@ -364,7 +365,7 @@ def show_link(imu_angle: Any, links: Links, step: Step, world: int) -> None:
 
 
 class Physics(NamedTuple):
-    """MuJoCo's arrays that a step of a walker reads, one row per world."""
+    """Arrays of MuJoCo that a walker's step reads, one row per world."""
 
     qpos: Array
     qvel: Array
@@ -379,11 +380,11 @@ class Walker(NamedTuple):
 
     Attributes:
         constants: Addresses, feet, sensors and rules: records of `CONSTANTS`, (kinds,).
-        plan: One record per control step.
-        bias: What is drawn per episode, (num_worlds,).
-        inertial: Records of `INERTIAL` beside the constants, or None where no robot has such an
-            IMU: its filter is then not even compiled. It is therefore an argument of its own.
-        columns: Where the observation has what they show, (1,).
+        plan: Records of `PLAN_ROW`, (steps,).
+        bias: Records of `BIAS`, drawn per episode, (num_worlds,).
+        inertial: Records of `INERTIAL`, (kinds,); None where no robot has such an IMU. Its filter
+            is then not compiled, which needs `inertial` as a separate argument of the functions.
+        columns: First column of each group of the observation, (1,).
     """
 
     constants: Any
@@ -395,42 +396,39 @@ class Walker(NamedTuple):
 
 @compiled
 def begin_walk(physics: Any, step: Any, walker: Any, worlds: BoolArray) -> None:
-    """Truth and measurements of walkers at the start of an episode in some worlds.
-
-    The walkers have been at rest.
-    """
+    """Fill truth and measurements of resting walkers at the start of an episode in some worlds."""
     physics = Physics(*physics)
-    step = step_of(*step)
+    step = step_at(*step)
     walker = Walker(*walker)
     for world in range(len(worlds)):
         if worlds[world]:
             begin_joints(physics.qpos, physics.qvel, step, world)
             step.worlds[world].truth.contact_since = -1
             read_body(physics, walker, step, world)
-            stand_off(step.worlds[world].truth, walker.plan[0])
-            drawn = sample_of(step, world)
-            settle_imu(walker.inertial, walker, step, world, drawn)
+            update_foot_drift(step.worlds[world].truth, walker.plan[0])
+            noise = next_noise(step, world)
+            settle_imu(walker.inertial, walker, step, world, noise)
             is_due = walker.plan[0].imu_is_due
-            measure(walker.inertial, walker, step, world, drawn, is_due)
+            measure_walk(walker.inertial, walker, step, world, noise, is_due)
 
 
 @compiled
 def sense_walk(physics: Any, step: Any, walker: Any, control: Any, first: int, stride: int) -> bool:
-    """Everything after the physics in a walker: read, measure, end, score, observe.
+    """Process walkers after the physics: read, measure, end, score, observe.
 
     Args:
         physics: State of all worlds, `Physics`.
         step: `Step`.
         walker: `Walker`.
         control: `Control`.
-        first: World that it begins with.
-        stride: From one of its worlds to the next, see `EVERY_WORLD`.
+        first: First world.
+        stride: Distance to the next world, see `EVERY_WORLD`.
 
     Returns:
-        Whether an episode ends.
+        True if an episode ends.
     """
     physics = Physics(*physics)
-    step = step_of(*step)
+    step = step_at(*step)
     walker = Walker(*walker)
     control = Control(*control)
     sense_joints(physics.qpos, physics.qvel, step, control, first, stride)
@@ -439,53 +437,120 @@ def sense_walk(physics: Any, step: Any, walker: Any, control: Any, first: int, s
     for world in range(first, len(diverged), stride):
         rules = walker.constants[step.kind[world]]
         truth = step.worlds[world].truth
-        if truth.step == rules.skips_at:
+        if truth.step == rules.skip_step:
             truth.step += walker.bias[world].skipped
-        planned = row_of(walker.plan, truth.step)
+        planned = plan_row(walker.plan, truth.step)
         if not diverged[world]:
             read_body(physics, walker, step, world)
-            stand_off(truth, planned)
-            drawn = sample_of(step, world)
-            advance_imu(walker.inertial, walker, step, world, drawn)
-            measure(walker.inertial, walker, step, world, drawn, planned.imu_is_due)
+            update_foot_drift(truth, planned)
+            noise = next_noise(step, world)
+            advance_imu(walker.inertial, walker, step, world, noise)
+            measure_walk(walker.inertial, walker, step, world, noise, planned.imu_is_due)
         watch_swing_foot(truth, planned, rules.loaded_n)
         ends = control.ends[:, world]
         is_last = truth.step >= len(walker.plan) - 1
-        is_over = end(truth, rules, diverged[world], is_last, ends) or is_over
+        is_over = end_episode(truth, rules, diverged[world], is_last, ends) or is_over
         scores = step.worlds[world].scores
-        control.reward[world] = score(truth, planned, rules.weights, ends[2], scores)
-        observe_walk(step, walker, world, control.observed[world])
+        control.reward[world] = score_walk(truth, planned, rules.weights, ends[2], scores)
+        observe_walk(step, walker, world, control.observation[world])
     return is_over
 
 
 @compiled
-def show_walk(step: Any, walker: Any, observed: Array) -> None:
-    """The walker's columns of observations of the present state."""
-    step = step_of(*step)
+def observe_all_walkers(step: Any, walker: Any, observation: Array) -> None:
+    """Fill the walkers' columns of all observations from the present state."""
+    step = step_at(*step)
     walker = Walker(*walker)
-    for world in range(len(observed)):
-        observe_walk(step, walker, world, observed[world])
+    for world in range(len(observation)):
+        observe_walk(step, walker, world, observation[world])
 
 
 @compiled_part
-def row_of(plan: Any, step: int) -> Any:
-    """Row of the plan at a control step; after the end its last row."""
+def observe_walk(step: Step, walker: Walker, world: int, observation: Array) -> None:
+    """Fill the columns of an observation that are not the joints'."""
+    is_delayed = step.rules[step.kind[world]].is_delayed
+    measured = step.last_worlds[world].measured if is_delayed else step.worlds[world].measured
+    coming = plan_row(walker.plan, step.worlds[world].truth.step + 1)
+    columns = walker.columns[0]
+    observation[columns.load_share] = coming.share
+    for i in range(2):
+        observation[columns.imu_attitude + i] = measured.imu_attitude[i]
+        observation[columns.zmp_reference + i] = coming.zmp[i]
+    for i in range(3):
+        observation[columns.imu_rate + i] = measured.imu_rate[i]
+        observation[columns.clock + i] = coming.clock[i]
+        for foot in range(2):
+            for part in range(2):
+                column = columns.wrench + 6 * foot + 3 * part + i
+                observation[column] = measured.wrench[foot, part, i]
+
+
+@compiled_part
+def plan_row(plan: Any, step: int) -> Any:
+    """Row of the plan at a control step; its last row after the end."""
     return plan[min(step, len(plan) - 1)]
 
 
+# walkers: end of the episode and reward
+
+
 @compiled_part
-def sample_of(step: Step, world: int) -> Any:
-    """The next sample of a world."""
-    used = step.used[world]
-    step.used[world] += 1
-    return step.samples[min(used, len(step.samples) - 1), world]
+def end_episode(row: Any, rules: Any, diverged: bool, is_last: bool, ends: BoolArray) -> bool:
+    """Fill the ends of a world, see `Control`; a world that diverged has not fallen.
+
+    Returns:
+        True if its episode ends.
+    """
+    is_down = row.pelvis[2] < rules.lowest_pelvis_m or row.tilt > rules.highest_tilt_rad
+    has_fallen = is_down and not diverged
+    is_terminated = diverged or has_fallen
+    ends[0] = diverged
+    ends[1] = has_fallen
+    ends[2] = is_terminated
+    ends[3] = is_last and not is_terminated
+    return is_terminated or is_last
+
+
+@compiled_part
+def score_walk(row: Any, planned: Any, weights: Any, is_failed: bool, terms: Any) -> float:
+    """Fill the weighted terms of the reward, and return their sum."""
+    x = row.zmp[0] - planned.zmp[0]
+    y = row.zmp[1] - planned.zmp[1]
+    drift_x = row.drift[0]
+    drift_y = row.drift[1]
+    in_feet = math.hypot(x - drift_x, y - drift_y)
+    terms.tilt = weights.tilt * planned.weight * tilt_penalty(row.tilt)
+    terms.zmp = weights.zmp * planned.weight * distance_penalty(math.hypot(x, y))
+    terms.effort = weights.effort * -row.servo_torque
+    terms.smoothness = weights.smoothness * -row.command_rate
+    terms.fall = weights.fall * (-1.0 if is_failed else 0.0)
+    terms.zmp_in_feet = weights.zmp_in_feet * planned.weight * distance_penalty(in_feet)
+    drift = math.hypot(drift_x, drift_y)
+    terms.foot_drift = weights.foot_drift * planned.weight * distance_penalty(drift)
+    total = terms.tilt + terms.zmp + terms.effort + terms.smoothness + terms.fall
+    return total + (terms.zmp_in_feet + terms.foot_drift)
+
+
+@compiled_part
+def tilt_penalty(tilt: Parameter) -> Any:
+    """−|tilt| [rad]: linear, so that the penalty never saturates."""
+    return -np.abs(tilt)
+
+
+@compiled_part
+def distance_penalty(distance: Parameter) -> Any:
+    """−distance [m]; −0 where it is nan because the feet are not loaded."""
+    return -np.fmax(distance, 0.0)
+
+
+# walkers: state of pelvis and feet
 
 
 @compiled_part
 def read_body(physics: Physics, walker: Walker, step: Step, world: int) -> None:
-    """State of pelvis and feet as the physics has it, force of the ground, and the ZMP.
+    """Copy the state of pelvis and feet from the physics, and compute ground force and ZMP.
 
-    MuJoCo's wrench acts on the foot, ours on the leg.
+    MuJoCo's wrench acts on the foot, ours on the leg: hence the sign.
     """
     constants = walker.constants[step.kind[world]]
     row = step.worlds[world].truth
@@ -510,37 +575,108 @@ def read_body(physics: Physics, walker: Walker, step: Step, world: int) -> None:
                 frames[foot, i, j] = physics.site_xmat[world, ankle, 3 * i + j]
     rotation_of(row.quaternion, frames[2])
     up = frames[2, 2]
-    row.roll, row.pitch, row.tilt = attitude_by(up[0], up[1], up[2])
+    row.roll, row.pitch, row.tilt = attitude_from_vertical(up[0], up[1], up[2])
     weight = constants.foot_weight
     force = ground[0]
     moment = ground[1]
-    ground_wrench(row.wrench, frames, constants.foot_com, weight, force, moment)
-    moment_point(force, moment, row.ankles, constants.zmp_n, row.zmp)
+    compute_ground_wrench(row.wrench, frames, constants.foot_com, weight, force, moment)
+    compute_zmp(force, moment, row.ankles, constants.zmp_n, row.zmp)
     row.force[0] = force[0, 2]
     row.force[1] = force[1, 2]
 
 
 @compiled_part
-def stand_off(row: Any, planned: Any) -> None:
-    """Where the feet stand against the plan; nan where there is no ZMP."""
-    drift_of_feet(row.force, row.ankles, planned.ankles, row.drift)
-    if np.isnan(row.zmp[0]):
-        row.drift[0] = row.drift[1] = np.nan
-
-
-@compiled_part
-def attitude_by(up_x: float, up_y: float, up_z: float) -> tuple[float, float, float]:
+def attitude_from_vertical(up_x: float, up_y: float, up_z: float) -> tuple[float, float, float]:
     """Roll and pitch (of yaw, pitch, roll), and the angle between z axis and vertical [rad].
 
-    They follow from the vertical in the frame that is tilted, a unit vector [1].
+    The argument is the vertical in the tilted frame, a unit vector [1].
     """
     pitch = math.asin(min(max(-up_x, -1.0), 1.0))
     return math.atan2(up_y, up_z), pitch, math.atan2(math.hypot(up_x, up_y), up_z)
 
 
 @compiled_part
+def compute_ground_wrench(
+    sensors: Array, foot_R: Array, com: Array, weight: Array, force: Array, moment: Array
+) -> None:
+    """Compute the wrench of the ground on the feet of one robot.
+
+    Args:
+        sensors: Force and moment on the legs, in the frames of the feet, (L, 2, 3) [N], [N·m].
+        foot_R: Orientations of the feet, (L, 3, 3).
+        com: Center of mass of the feet, as in `FootSensors`, (L, 3) [m].
+        weight: Weight of the feet, as in `FootSensors`, (L, 3) [N].
+        force: Output: force in the world frame, (L, 3) [N].
+        moment: Output: moment about the ankles in the world frame, (L, 3) [N·m].
+    """
+    c = np.empty(3)
+    for foot in range(len(sensors)):
+        R = foot_R[foot]
+        f, n = sensors[foot]
+        w = weight[foot]
+        p = com[foot]
+        for i in range(3):
+            c[i] = R[i, 0] * p[0] + R[i, 1] * p[1] + R[i, 2] * p[2]
+            force[foot, i] = R[i, 0] * f[0] + R[i, 1] * f[1] + R[i, 2] * f[2] - w[i]
+            moment[foot, i] = R[i, 0] * n[0] + R[i, 1] * n[1] + R[i, 2] * n[2]
+        moment[foot, 0] -= c[1] * w[2] - c[2] * w[1]
+        moment[foot, 1] -= c[2] * w[0] - c[0] * w[2]
+        moment[foot, 2] -= c[0] * w[1] - c[1] * w[0]
+
+
+@compiled_part
+def compute_zmp(force: Array, moment: Array, ankle: Array, least_n: float, zmp: Array) -> None:
+    r"""Compute the ZMP of both feet of one robot on the ground plane z = 0: into `zmp`, (2,) [m].
+
+    The ZMP is nan where the feet carry less than `least_n`. M and F are the moment and the force of
+    the ground on the feet about the origin:
+
+    .. math:: x = -M_y / F_z, \quad y = M_x / F_z
+    """
+    about_x = about_y = vertical = 0.0
+    for foot in range(len(force)):
+        f = force[foot]
+        n = moment[foot]
+        p = ankle[foot]
+        about_x += p[1] * f[2] - p[2] * f[1] + n[0]
+        about_y += p[2] * f[0] - p[0] * f[2] + n[1]
+        vertical += f[2]
+    scale = vertical if vertical >= least_n else np.nan
+    zmp[0] = -about_y / scale
+    zmp[1] = about_x / scale
+
+
+@compiled_part
+def update_foot_drift(row: Any, planned: Any) -> None:
+    """Compute the drift of the feet against the plan; nan where there is no ZMP."""
+    compute_foot_drift(row.force, row.ankles, planned.ankles, row.drift)
+    if np.isnan(row.zmp[0]):
+        row.drift[0] = row.drift[1] = np.nan
+
+
+@compiled_part
+def compute_foot_drift(force: Array, ankle: Array, planned: Array, drift: Array) -> None:
+    r"""Compute the displacement of standing feet against the plan: into `drift`, (2,) [m].
+
+    .. math:: d = \sum_i w_i \, (p_i - p_{i, plan}), \quad w_i = F_{z, i} / \sum_j F_{z, j}
+
+    The displacement is in the ground plane. It is continuous, as the weights are, and nan where the
+    feet carry nothing. The ZMP minus d is the ZMP of the same wrenches on feet at their planned
+    places.
+    """
+    carried = 0.0
+    for foot in range(len(force)):
+        carried += force[foot]
+    for i in range(2):
+        total = 0.0 if carried > 0.0 else np.nan
+        for foot in range(len(force)):
+            total += force[foot] / carried * (ankle[foot, i] - planned[foot, i])
+        drift[i] = total
+
+
+@compiled_part
 def watch_swing_foot(row: Any, planned: Any, loaded_n: float) -> None:
-    """Since when the swing foot has been on the ground in the second half of its swing."""
+    """Record the step in which the swing foot first touches down in the second half of a swing."""
     if planned.half_of_swing == FIRST_HALF:
         row.contact_since = -1
     is_landing = planned.half_of_swing == SECOND_HALF and row.contact_since < 0
@@ -548,44 +684,47 @@ def watch_swing_foot(row: Any, planned: Any, loaded_n: float) -> None:
         row.contact_since = row.step
 
 
+# walkers: measurements
+
+
 @compiled_part
-def measure(
+def measure_walk(
     inertial: Any, walker: Walker, step: Step, world: int, noise: Any, imu_is_due: bool
 ) -> None:
-    """Sample IMU and foot sensors; an IMU that is not due shows its last sample."""
+    """Sample IMU and foot sensors; an IMU that is not due keeps its last sample."""
     quality = walker.constants[step.kind[world]]
     sigma = quality.noise
     row = step.worlds[world].truth
-    shown = step.worlds[world].shown
+    measured = step.worlds[world].measured
     for foot in range(2):
         for part in range(2):
             for i in range(3):
                 error = noise.wrench[foot, part, i] * sigma.wrench[foot, part, i]
-                shown.wrench[foot, part, i] = error + row.wrench[foot, part, i]
+                measured.wrench[foot, part, i] = error + row.wrench[foot, part, i]
     if walker.bias[world].has_foot_errors:
         seconds = row.step * step.rules[step.kind[world]].control_period_s
-        add_foot_errors(walker.bias[world], row.wrench, seconds, shown.wrench)
-    if not imu_is_due or show_inertial(inertial, walker, step, world):
+        add_foot_errors(walker.bias[world], row.wrench, seconds, measured.wrench)
+    if not imu_is_due or read_inertial_imu(inertial, walker, step, world):
         return
     bias = walker.bias[world].imu_attitude
     for i, angle in enumerate((row.roll, row.pitch)):
-        drawn = sigma.imu_attitude[i] * noise.imu_attitude[i]
-        shown.imu_attitude[i] = shown_angle(
-            angle, bias[i], drawn, quality.imu_bias_rad, quality.imu_sine_error_rad
+        angle_noise = sigma.imu_attitude[i] * noise.imu_attitude[i]
+        measured.imu_attitude[i] = measured_angle(
+            angle, bias[i], angle_noise, quality.imu_bias_rad, quality.imu_sine_error_rad
         )
     for i in range(3):
-        shown.imu_rate[i] = noise.imu_rate[i] * sigma.imu_rate[i] + row.pelvis_rate[i]
+        measured.imu_rate[i] = noise.imu_rate[i] * sigma.imu_rate[i] + row.pelvis_rate[i]
 
 
 @compiled_part
-def add_foot_errors(bias: Any, wrench: Array, seconds: float, shown: Array) -> None:
+def add_foot_errors(bias: Any, wrench: Array, seconds: float, measured: Array) -> None:
     """Add bias, drift and cross-talk of the feet's sensors, see `elastic_env.world.foot_sensors`.
 
     Args:
-        bias: Errors of the world.
+        bias: Record of `BIAS` of the world.
         wrench: True wrench, (2, 2, 3) [N], [N·m].
-        seconds: Since the start of the episode [s].
-        shown: To be added to, as `wrench`.
+        seconds: Time since the start of the episode [s].
+        measured: Measured wrench, to which the errors are added, as `wrench`.
     """
     for foot in range(2):
         for row in range(6):
@@ -596,14 +735,15 @@ def add_foot_errors(bias: Any, wrench: Array, seconds: float, shown: Array) -> N
             for column in range(6):
                 share = bias.cross_talk[foot, row, column]
                 error += share * wrench[foot, column // 3, column % 3]
-            shown[foot, part, i] += error
+            measured[foot, part, i] += error
 
 
 @compiled_part
-def show_inertial(inertial: Any, walker: Walker, step: Step, world: int) -> bool:
-    """Show the state of an inertial IMU, where one is fitted; the result says so.
+def read_inertial_imu(inertial: Any, walker: Walker, step: Step, world: int) -> bool:
+    """Read the state of an inertial IMU, and add the errors of its mounting.
 
-    Errors of the mounting come on top.
+    Returns:
+        True if the world has an inertial IMU.
     """
     if inertial is None:
         return False
@@ -611,35 +751,36 @@ def show_inertial(inertial: Any, walker: Walker, step: Step, world: int) -> bool
         return False
     quality = walker.constants[step.kind[world]]
     bias = walker.bias[world].imu_attitude
-    shown = step.worlds[world].shown
-    roll, pitch, _ = attitude_by(shown.imu_up[0], shown.imu_up[1], shown.imu_up[2])
+    measured = step.worlds[world].measured
+    up = measured.imu_up
+    roll, pitch, _ = attitude_from_vertical(up[0], up[1], up[2])
     for i, angle in enumerate((roll, pitch)):
-        shown.imu_attitude[i] = shown_angle(
+        measured.imu_attitude[i] = measured_angle(
             angle, bias[i], 0.0, quality.imu_bias_rad, quality.imu_sine_error_rad
         )
     for i in range(3):
-        shown.imu_rate[i] = shown.imu_gyro[i]
+        measured.imu_rate[i] = measured.imu_gyro[i]
     return True
 
 
 @compiled_part
 def settle_imu(inertial: Any, walker: Any, step: Step, world: int, noise: Any) -> None:
-    """Settle an inertial IMU that has been at rest for long, a bias of its gyroscope included."""
+    """Set an inertial IMU to the state that it reaches at rest, including the gyroscope's bias."""
     if inertial is None:
         return
     sensor = inertial[step.kind[world]]
     bias = walker.bias[world]
     sigma = walker.constants[step.kind[world]].noise
     row = step.worlds[world].truth
-    shown = step.worlds[world].shown
+    measured = step.worlds[world].measured
     force = np.empty(3)
     if not sensor.is_fitted:
         return
     specific_force(row, row, 1.0, sensor.gravity_m_s2, force)
     for i in range(3):
         force[i] += bias.specific_force[i]
-        shown.imu_gyro[i] = bias.gyro[i] + noise.imu_rate[i] * sigma.imu_rate[i]
-    settled_vertical(shown.imu_up, force, bias.gyro, sensor.time_constant_s)
+        measured.imu_gyro[i] = bias.gyro[i] + noise.imu_rate[i] * sigma.imu_rate[i]
+    settled_vertical(measured.imu_up, force, bias.gyro, sensor.time_constant_s)
 
 
 @compiled_part
@@ -649,11 +790,11 @@ def advance_imu(inertial: Any, walker: Any, step: Step, world: int, noise: Any) 
     Its gyroscope measures the mean rate, and its filter turns the vertical.
 
     Args:
-        inertial: That of `walker`.
+        inertial: `inertial` of `walker`.
         walker: `Walker`.
-        step: `Step`, whose measurements `imu_gyro` and `imu_up` are brought up to date.
-        world: Number of the world.
-        noise: Sample of the sensors; that of the attitude is of the accelerometer, across the
+        step: `Step`, whose measurements `imu_gyro` and `imu_up` are updated.
+        world: Index of the world.
+        noise: Sample of the sensors' noise; `imu_attitude` is the accelerometer's, across the
             vertical.
     """
     if inertial is None:
@@ -667,7 +808,7 @@ def advance_imu(inertial: Any, walker: Any, step: Step, world: int, noise: Any) 
     period_s = step.rules[step.kind[world]].control_period_s
     before = step.last_worlds[world].truth
     row = step.worlds[world].truth
-    shown = step.worlds[world].shown
+    measured = step.worlds[world].measured
     force = np.empty(3)
     turned = np.empty(3)
     specific_force(before, row, period_s, gravity, force)
@@ -677,21 +818,21 @@ def advance_imu(inertial: Any, walker: Any, step: Step, world: int, noise: Any) 
     force[1] += gravity * sigma.imu_attitude[0] * noise.imu_attitude[0]
     for i in range(3):
         force[i] += bias.specific_force[i]
-        drawn = noise.imu_rate[i] * sigma.imu_rate[i]
-        rate = turned[i] / period_s + bias.gyro[i] + drawn
-        shown.imu_gyro[i] = rate
+        rate_noise = noise.imu_rate[i] * sigma.imu_rate[i]
+        rate = turned[i] / period_s + bias.gyro[i] + rate_noise
+        measured.imu_gyro[i] = rate
         turned[i] = rate * period_s
     gain = 1.0 - math.exp(-period_s / sensor.time_constant_s)
-    complementary_filter(shown.imu_up, turned, force, gain)
+    complementary_filter(measured.imu_up, turned, force, gain)
 
 
 @compiled_part
 def specific_force(
     before: Any, row: Any, period_s: float, gravity_m_s2: float, force: Array
 ) -> None:
-    """Mean specific force over a period, in the frame at its end: into `force` [m/s²].
+    """Compute the mean specific force over a period, in the frame at its end: into `force` [m/s²].
 
-    It is acceleration minus gravity.
+    Specific force is acceleration minus gravity.
     """
     R = np.empty((3, 3))
     rotation_of(row.quaternion, R)
@@ -704,69 +845,50 @@ def specific_force(
         force[i] = R[0, i] * a + R[1, i] * b + R[2, i] * c
 
 
-@compiled_part
-def rotation_of(quaternion: Array, R: Array) -> None:
-    """Rotation matrix of a unit quaternion w, x, y, z: into `R`, (3, 3)."""
-    w = quaternion[0]
-    x = quaternion[1]
-    y = quaternion[2]
-    z = quaternion[3]
-    R[0, 0] = 1 - 2 * (y * y + z * z)
-    R[0, 1] = 2 * (x * y - w * z)
-    R[0, 2] = 2 * (x * z + w * y)
-    R[1, 0] = 2 * (x * y + w * z)
-    R[1, 1] = 1 - 2 * (x * x + z * z)
-    R[1, 2] = 2 * (y * z - w * x)
-    R[2, 0] = 2 * (x * z - w * y)
-    R[2, 1] = 2 * (y * z + w * x)
-    R[2, 2] = 1 - 2 * (x * x + y * y)
-
-
-@compiled
-def rotations_of(quaternions: Array) -> Array:
-    """Rotation matrices of unit quaternions, (n, 4) to (n, 3, 3)."""
-    R = np.empty((len(quaternions), 3, 3))
-    for row in range(len(quaternions)):
-        rotation_of(quaternions[row], R[row])
-    return R
+# sensors of all robots
 
 
 @compiled_part
-def rotation_between(before: Array, after: Array, turned: Array) -> None:
-    """Rotation vector from one unit quaternion to another: into `turned`, (3,) [rad].
+def next_noise(step: Step, world: int) -> Any:
+    """Return the next noise sample of a world, and count it as used."""
+    used = step.used[world]
+    step.used[world] += 1
+    return step.samples[min(used, len(step.samples) - 1), world]
 
-    It stands in the frame that turns.
-    """
-    a = before
-    b = after
-    w = a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3]
-    turned[0] = a[0] * b[1] - a[1] * b[0] - a[2] * b[3] + a[3] * b[2]
-    turned[1] = a[0] * b[2] + a[1] * b[3] - a[2] * b[0] - a[3] * b[1]
-    turned[2] = a[0] * b[3] - a[1] * b[2] + a[2] * b[1] - a[3] * b[0]
-    sine = math.sqrt(turned[0] ** 2 + turned[1] ** 2 + turned[2] ** 2)
-    # q and −q are one rotation: the shorter way
-    scale = 2.0 * math.atan2(sine, abs(w)) / sine if sine > 0.0 else 2.0
-    for i in range(3):
-        turned[i] *= math.copysign(scale, w)
+
+@within_compiled
+def round_to_counts(angle: Any, count_rad: Any) -> Any:
+    """Angle of the nearest whole count of an encoder [rad]."""
+    return np.rint(angle / count_rad) * count_rad
+
+
+@within_compiled
+def measured_angle(
+    angle: Any, drawn_bias: Any, noise: Any, bias_rad: float, sine_error_rad: float
+) -> Any:
+    """Angle that an IMU measures, see `elastic_env.world.sensors.attitude` [rad]."""
+    return angle + drawn_bias + noise + (bias_rad + sine_error_rad * np.sin(angle))
+
+
+# filter of an inertial IMU
 
 
 @compiled
 def complementary_filter(up: Array, turned: Array, force: Array, gain: float) -> None:
-    r"""One step of the explicit complementary filter of the vertical [Mahony2008].
+    r"""Take one step of the explicit complementary filter of the vertical [Mahony2008].
 
-    The bias is not estimated.
+    The filter does not estimate the gyroscope's bias.
 
     .. math:: \dot u = u \times (\omega + \tfrac{1}{\tau} \, f / |f| \times u)
 
     Args:
-        up: Vertical in the frame of the sensor, a unit vector, which is brought up to date, (3,)
-            [1].
-        turned: Rotation of the sensor by its gyroscope, as a vector in its frame, (3,) [rad].
-        force: Specific force by its accelerometer in the frame after it, (3,) [m/s²].
+        up: Vertical in the frame of the sensor, a unit vector, updated in place, (3,) [1].
+        turned: Rotation vector of the sensor by its gyroscope, in its frame, (3,) [rad].
+        force: Specific force by its accelerometer, in the frame after the rotation, (3,) [m/s²].
         gain: 1 − exp(−period/τ) [1].
     """
     angle = math.sqrt(turned[0] ** 2 + turned[1] ** 2 + turned[2] ** 2)
-    # what stands still in the world turns backwards in the frame of the sensor
+    # a direction at rest in the world turns backwards in the frame of the sensor
     sine = math.sin(angle) / angle if angle > 0.0 else 1.0
     cosine = (1.0 - math.cos(angle)) / (angle * angle) if angle > 0.0 else 0.5
     x = up[0]
@@ -794,9 +916,13 @@ def complementary_filter(up: Array, turned: Array, force: Array, gain: float) ->
 
 @compiled
 def settled_vertical(up: Array, force: Array, gyro: Array, delay_s: float) -> None:
-    """The vertical where a filter with a time constant `delay_s` rests: into `up`, (3,).
+    """Compute the vertical at which the filter comes to rest: into `up`, (3,) [1].
 
-    The force is constant, and the bias of the gyroscope is small.
+    Args:
+        up: Output.
+        force: Constant specific force, (3,) [m/s²].
+        gyro: Small bias of the gyroscope, (3,) [rad/s].
+        delay_s: Time constant of the filter [s].
     """
     size = math.sqrt(force[0] ** 2 + force[1] ** 2 + force[2] ** 2)
     x = force[0] / size
@@ -812,6 +938,55 @@ def settled_vertical(up: Array, force: Array, gyro: Array, delay_s: float) -> No
     up[2] = z / size
 
 
+# rotations and means
+
+
+@compiled_part
+def rotation_of(quaternion: Array, R: Array) -> None:
+    """Compute the rotation matrix of a unit quaternion w, x, y, z: into `R`, (3, 3)."""
+    w = quaternion[0]
+    x = quaternion[1]
+    y = quaternion[2]
+    z = quaternion[3]
+    R[0, 0] = 1 - 2 * (y * y + z * z)
+    R[0, 1] = 2 * (x * y - w * z)
+    R[0, 2] = 2 * (x * z + w * y)
+    R[1, 0] = 2 * (x * y + w * z)
+    R[1, 1] = 1 - 2 * (x * x + z * z)
+    R[1, 2] = 2 * (y * z - w * x)
+    R[2, 0] = 2 * (x * z - w * y)
+    R[2, 1] = 2 * (y * z + w * x)
+    R[2, 2] = 1 - 2 * (x * x + y * y)
+
+
+@compiled
+def rotations_of(quaternions: Array) -> Array:
+    """Rotation matrices of unit quaternions, (n, 4) to (n, 3, 3)."""
+    R = np.empty((len(quaternions), 3, 3))
+    for row in range(len(quaternions)):
+        rotation_of(quaternions[row], R[row])
+    return R
+
+
+@compiled_part
+def rotation_between(before: Array, after: Array, turned: Array) -> None:
+    """Compute the rotation vector between two unit quaternions: into `turned`, (3,) [rad].
+
+    Its coordinates are those of the rotating frame.
+    """
+    a = before
+    b = after
+    w = a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3]
+    turned[0] = a[0] * b[1] - a[1] * b[0] - a[2] * b[3] + a[3] * b[2]
+    turned[1] = a[0] * b[2] + a[1] * b[3] - a[2] * b[0] - a[3] * b[1]
+    turned[2] = a[0] * b[3] - a[1] * b[2] + a[2] * b[1] - a[3] * b[0]
+    sine = math.sqrt(turned[0] ** 2 + turned[1] ** 2 + turned[2] ** 2)
+    # q and −q are the same rotation: take the shorter way
+    scale = 2.0 * math.atan2(sine, abs(w)) / sine if sine > 0.0 else 2.0
+    for i in range(3):
+        turned[i] *= math.copysign(scale, w)
+
+
 @compiled_part
 def cross(x: float, y: float, z: float, other: Array) -> tuple[float, float, float]:
     """Cross product of (x, y, z) with another vector."""
@@ -820,88 +995,9 @@ def cross(x: float, y: float, z: float, other: Array) -> tuple[float, float, flo
     return a, b, x * other[1] - y * other[0]
 
 
-@within_compiled
-def in_whole_counts(angle: Any, count_rad: Any) -> Any:
-    """The nearest whole counts of an encoder, as an angle [rad]."""
-    return np.rint(angle / count_rad) * count_rad
-
-
-@within_compiled
-def shown_angle(
-    angle: Any, drawn_bias: Any, noise: Any, bias_rad: float, sine_error_rad: float
-) -> Any:
-    """An angle by the IMU, see `elastic_env.world.sensors.attitude` [rad]."""
-    return angle + drawn_bias + noise + (bias_rad + sine_error_rad * np.sin(angle))
-
-
-@compiled_part
-def end(row: Any, rules: Any, diverged: bool, is_last: bool, ends: BoolArray) -> bool:
-    """Say what ends the episode of a world, if anything does; what has diverged has not fallen."""
-    is_down = row.pelvis[2] < rules.lowest_pelvis_m or row.tilt > rules.highest_tilt_rad
-    has_fallen = is_down and not diverged
-    is_terminated = diverged or has_fallen
-    ends[0] = diverged
-    ends[1] = has_fallen
-    ends[2] = is_terminated
-    ends[3] = is_last and not is_terminated
-    return is_terminated or is_last
-
-
-@compiled_part
-def score(row: Any, planned: Any, weights: Any, is_failed: bool, terms: Any) -> float:
-    """Weighted terms of the reward, and their sum."""
-    x = row.zmp[0] - planned.zmp[0]
-    y = row.zmp[1] - planned.zmp[1]
-    drift_x = row.drift[0]
-    drift_y = row.drift[1]
-    in_feet = math.hypot(x - drift_x, y - drift_y)
-    terms.tilt = weights.tilt * planned.weight * tilt_penalty(row.tilt)
-    terms.zmp = weights.zmp * planned.weight * distance_penalty(math.hypot(x, y))
-    terms.effort = weights.effort * -row.servo_torque
-    terms.smoothness = weights.smoothness * -row.command_rate
-    terms.fall = weights.fall * (-1.0 if is_failed else 0.0)
-    terms.zmp_in_feet = weights.zmp_in_feet * planned.weight * distance_penalty(in_feet)
-    drift = math.hypot(drift_x, drift_y)
-    terms.foot_drift = weights.foot_drift * planned.weight * distance_penalty(drift)
-    total = terms.tilt + terms.zmp + terms.effort + terms.smoothness + terms.fall
-    return total + (terms.zmp_in_feet + terms.foot_drift)
-
-
-@compiled_part
-def tilt_penalty(tilt: Parameter) -> Any:
-    """−|tilt| [rad]: linear, so that a large error never stops to matter."""
-    return -np.abs(tilt)
-
-
-@compiled_part
-def distance_penalty(distance: Parameter) -> Any:
-    """−distance [m]; none where the feet are not loaded and it is nan."""
-    return -np.fmax(distance, 0.0)
-
-
-@compiled_part
-def observe_walk(step: Step, walker: Walker, world: int, observed: Array) -> None:
-    """Fill the walker's columns of an observation, beside those of its joints."""
-    is_delayed = step.rules[step.kind[world]].is_delayed
-    shown = step.last_worlds[world].shown if is_delayed else step.worlds[world].shown
-    coming = row_of(walker.plan, step.worlds[world].truth.step + 1)
-    columns = walker.columns[0]
-    observed[columns.load_share] = coming.share
-    for i in range(2):
-        observed[columns.imu_attitude + i] = shown.imu_attitude[i]
-        observed[columns.zmp_reference + i] = coming.zmp[i]
-    for i in range(3):
-        observed[columns.imu_rate + i] = shown.imu_rate[i]
-        observed[columns.clock + i] = coming.clock[i]
-        for foot in range(2):
-            for part in range(2):
-                column = columns.wrench + 6 * foot + 3 * part + i
-                observed[column] = shown.wrench[foot, part, i]
-
-
 @compiled_part
 def rms(values: Array) -> float:
-    """Root of the mean square, added in order."""
+    """Root mean square, summed in order."""
     total = 0.0
     for value in values:
         total += value * value
@@ -911,73 +1007,7 @@ def rms(values: Array) -> float:
 @compiled
 def rms_of_rows(values: Array) -> Array:
     """`rms` of every row of (n, m)."""
-    found = np.empty(len(values))
+    result = np.empty(len(values))
     for row in range(len(values)):
-        found[row] = rms(values[row])
-    return found
-
-
-@compiled_part
-def ground_wrench(
-    sensors: Array, foot_R: Array, com: Array, weight: Array, force: Array, moment: Array
-) -> None:
-    """Wrench of the ground on the feet of one robot: into `force` and `moment`, (L, 3).
-
-    It is in the world, about the ankles [N], [N·m]. The sensors show force and moment on the leg,
-    in the frames of the feet, (L, 2, 3), whose orientations are (L, 3, 3). `FootSensors` has
-    center of mass and weight of the feet.
-    """
-    c = np.empty(3)
-    for foot in range(len(sensors)):
-        R = foot_R[foot]
-        f, n = sensors[foot]
-        w = weight[foot]
-        p = com[foot]
-        for i in range(3):
-            c[i] = R[i, 0] * p[0] + R[i, 1] * p[1] + R[i, 2] * p[2]
-            force[foot, i] = R[i, 0] * f[0] + R[i, 1] * f[1] + R[i, 2] * f[2] - w[i]
-            moment[foot, i] = R[i, 0] * n[0] + R[i, 1] * n[1] + R[i, 2] * n[2]
-        moment[foot, 0] -= c[1] * w[2] - c[2] * w[1]
-        moment[foot, 1] -= c[2] * w[0] - c[0] * w[2]
-        moment[foot, 2] -= c[0] * w[1] - c[1] * w[0]
-
-
-@compiled_part
-def moment_point(force: Array, moment: Array, ankle: Array, least_n: float, zmp: Array) -> None:
-    r"""ZMP of both feet of one robot on the ground plane z = 0: into `zmp`, (2,) [m].
-
-    It is nan where the feet carry less than `least_n`. With the ground's forces on the feet, taken
-    about the origin,
-
-    .. math:: x = -M_y / F_z, \quad y = M_x / F_z
-    """
-    about_x = about_y = vertical = 0.0
-    for foot in range(len(force)):
-        f = force[foot]
-        n = moment[foot]
-        p = ankle[foot]
-        about_x += p[1] * f[2] - p[2] * f[1] + n[0]
-        about_y += p[2] * f[0] - p[0] * f[2] + n[1]
-        vertical += f[2]
-    scale = vertical if vertical >= least_n else np.nan
-    zmp[0] = -about_y / scale
-    zmp[1] = about_x / scale
-
-
-@compiled_part
-def drift_of_feet(force: Array, ankle: Array, planned: Array, drift: Array) -> None:
-    r"""Displacement of standing feet against the plan, in the ground plane: into `drift`, (2,).
-
-    .. math:: d = \sum_i w_i \, (p_i - p_{i, plan}), \quad w_i = F_{z, i} / \sum_j F_{z, j}
-
-    It is continuous, as the weights are, and nan where nothing is carried. The ZMP minus d is the
-    ZMP of the same wrenches on feet that stand where they are planned.
-    """
-    carried = 0.0
-    for foot in range(len(force)):
-        carried += force[foot]
-    for i in range(2):
-        total = 0.0 if carried > 0.0 else np.nan
-        for foot in range(len(force)):
-            total += force[foot] / carried * (ankle[foot, i] - planned[foot, i])
-        drift[i] = total
+        result[row] = rms(values[row])
+    return result

@@ -1,4 +1,4 @@
-"""Gymnasium faces of the worlds: one world as an `Env`, many as a `VectorEnv`."""
+"""Gymnasium environments: one world as an `Env`, many worlds as a `VectorEnv`."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
@@ -26,15 +26,15 @@ Observation: TypeAlias = npt.NDArray[Any]
 Action: TypeAlias = npt.NDArray[Any]
 
 Seeds: TypeAlias = int | list[int | None] | None
-"""The first of a row of seeds, one for each world, or none."""
+"""Seed of the first world, whose successors follow; or one seed for each world; or none."""
 Flags: TypeAlias = npt.NDArray[Any]
 Info: TypeAlias = dict[str, Any]
 
 RENDER_MODES = ("rgb_array", "human")
 
 
-class _Faces:
-    """Properties of both environments."""
+class _EnvBase:
+    """Properties of both kinds of environments."""
 
     task: Task
     """The rules of this environment."""
@@ -44,7 +44,7 @@ class _Faces:
 
     @property
     def spec(self) -> EnvSpec | None:
-        """How Gymnasium made this environment, with the length of its episodes."""
+        """Gymnasium's specification of this environment, with the length of its episodes."""
         return self._spec
 
     @spec.setter
@@ -60,16 +60,16 @@ class _Faces:
 
     @property
     def simulation(self) -> Simulation:
-        """The physics, for benchmarks and tests; a policy has no business here."""
+        """The physics, for benchmarks and tests; policies must not use it."""
         return self.task.simulation
 
     def truth(self) -> Any:
-        """Noise-free state and true parameters, for scoring and the `oracle` policy alone."""
+        """Return noise-free state and true parameters, only for scoring and the `oracle` policy."""
         return self.task.truth()
 
     @property
     def picture(self) -> Picture:
-        """The picture of the worlds, made when it is first asked for."""
+        """The picture of the worlds, created at first use."""
         if self._picture is None:
             if self._make_picture is None:
                 raise ConfigurationError("this environment has no picture")
@@ -77,25 +77,25 @@ class _Faces:
         return self._picture
 
     def __getstate__(self) -> Info:
-        """Everything but window and renderer, which are made again when they are needed."""
+        """Return everything except window and renderer, which are created again on demand."""
         return {**vars(self), "_picture": None}
 
-    def _let_go(self) -> None:
-        """Close the window, free the renderer, let hardware go."""
+    def _release(self) -> None:
+        """Close the window, free the renderer, release the hardware."""
         self.task.simulation.close()
         if self._picture is not None:
             self._picture.close()
             self._picture = None
 
 
-class ElasticEnv(_Faces, gymnasium.Env[Observation, Action]):  # pyright: ignore[reportIncompatibleVariableOverride]
+class ElasticEnv(_EnvBase, gymnasium.Env[Observation, Action]):  # pyright: ignore[reportIncompatibleVariableOverride]
     """One world of a task.
 
     Args:
-        task: The rules, for one world.
+        task: Rules for one world.
         render_mode: "rgb_array", "human" or None.
-        picture: Makes the picture of the task when it is first rendered.
-        simulation: What moves instead of MuJoCo, such as hardware.
+        picture: Creates the picture of the task when it is first rendered.
+        simulation: Replacement for MuJoCo's physics, such as hardware.
     """
 
     metadata = {"render_modes": list(RENDER_MODES), "render_fps": 50}
@@ -124,17 +124,17 @@ class ElasticEnv(_Faces, gymnasium.Env[Observation, Action]):  # pyright: ignore
     ) -> tuple[Observation, Info]:
         """Begin an episode.
 
-        With options["robot_seed"] = s it has the robot, and the motion, that `reset(seed=s)` draws.
+        With options["robot_seed"] = s it has the robot and the motion that `reset(seed=s)` draws.
         """
         super().reset(seed=seed, options=options)
-        episodes = _episodes([self.np_random], _robot_seeds(options, 1))
-        self.task.restart(np.ones(1, dtype=np.bool_), episodes)
+        generators = _episode_generators([self.np_random], _robot_seeds(options, 1))
+        self.task.restart(np.ones(1, dtype=np.bool_), generators)
         self._steps = 0
         self._render_human()
-        return self.task.observe()[0], _first(self.task.signals())
+        return self.task.observe()[0], _info_of_one(self.task.signals())
 
     def step(self, action: Action) -> tuple[Observation, float, bool, bool, Info]:
-        """One control period under a command offset [rad]."""
+        """Advance by one control period under a command offset [rad]."""
         result = self.task.step(np.asarray(action)[None])
         self._steps += 1
         self._render_human()
@@ -143,18 +143,18 @@ class ElasticEnv(_Faces, gymnasium.Env[Observation, Action]):  # pyright: ignore
             result.reward.item(),
             result.terminated.item(),
             result.truncated.item(),
-            StepInfo({}, partial(_first, result.info)),
+            StepInfo({}, partial(_info_of_one, result.info)),
         )
 
     def render(self) -> Any:
-        """The present picture, (height, width, 3) uint8; None unless the mode is "rgb_array"."""
+        """Return the present picture, (height, width, 3) uint8; None without "rgb_array"."""
         if self.render_mode != "rgb_array":
             return None
         return self.picture.rgb(self.task.signals())
 
     def close(self) -> None:
-        """Close the window, free the renderer, let hardware go."""
-        self._let_go()
+        """Close the window, free the renderer, release the hardware."""
+        self._release()
 
     def _render_human(self) -> None:
         if self.render_mode == "human" and self._steps % self._steps_per_frame == 0:
@@ -162,20 +162,20 @@ class ElasticEnv(_Faces, gymnasium.Env[Observation, Action]):  # pyright: ignore
 
 
 class ElasticVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]  `spec` is a property
-    _Faces, gymnasium.vector.VectorEnv[Observation, Action, npt.NDArray[Any]]
+    _EnvBase, gymnasium.vector.VectorEnv[Observation, Action, npt.NDArray[Any]]
 ):
     """Many worlds of a task on a thread pool.
 
-    World i of `reset(seed=s)` is the scalar environment of `reset(seed=s + i)`, exactly, whatever
-    the number of worlds and threads.
+    World i of `reset(seed=s)` is exactly the scalar environment of `reset(seed=s + i)`, for any
+    number of worlds and threads.
 
     Args:
-        task: The rules, for num_envs worlds.
+        task: Rules for num_envs worlds.
         num_threads: Threads of the physics, 0 for all cores.
         autoreset_mode: Gymnasium's `AutoresetMode` or its value.
-        simulation: What moves instead of MuJoCo, such as hardware.
+        simulation: Replacement for MuJoCo's physics, such as hardware.
         render_mode: "rgb_array" or None.
-        picture: Makes the picture of the task when it is first rendered.
+        picture: Creates the picture of the task when it is first rendered.
     """
 
     def __init__(
@@ -188,8 +188,7 @@ class ElasticVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]  
         picture: Callable[[], Picture] | None = None,
     ) -> None:
         if render_mode not in (None, "rgb_array"):
-            what = "render mode of a vector environment"
-            raise unknown_name(what, render_mode, ["rgb_array"])
+            raise unknown_name("render mode of a vector environment", render_mode, ["rgb_array"])
         self.render_mode = render_mode
         self._make_picture = picture
         try:
@@ -209,38 +208,38 @@ class ElasticVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]  
         self._done = np.zeros(self.num_envs, dtype=np.bool_)
 
     def reset(self, *, seed: Seeds = None, options: Info | None = None) -> tuple[Observation, Info]:
-        """Begin an episode in every world, or in those of options["reset_mask"].
+        """Begin an episode in every world, or in the worlds of options["reset_mask"].
 
-        With options["robot_seed"] = s world i has the robot, and the motion, that `reset(seed=s)`
-        draws for it, under noise and pushes of its own: the same robot walks again. It may be a
-        list, as `seed`, with None for a new one.
+        With options["robot_seed"] = s world i has the robot and the motion that `reset(seed=s)`
+        draws for it, but new noise and pushes: the same robot walks again. Like `seed` it may be a
+        list; None then draws a new robot.
         """
         mask = reset_mask(options, self.num_envs)
         seeds = _seeds(seed, self.num_envs)
-        robots = _robot_seeds(options, self.num_envs)
+        robot_seeds = _robot_seeds(options, self.num_envs)
         for world in np.flatnonzero(mask):
             if seeds[world] is not None:
                 self._generators[world] = _generator(seeds[world])
-        self._begin(mask, robots)
+        self._restart(mask, robot_seeds)
         return self.task.observe(), self.task.signals()
 
     def step(self, actions: Action) -> tuple[Observation, Flags, Flags, Flags, Info]:
-        """One control period in every world under command offsets, (num_envs, n) [rad]."""
+        """Advance by one control period under command offsets, (num_envs, n) [rad]."""
         restarting = self._done
-        given = np.asarray(actions)
+        offset = np.asarray(actions)
         is_next = self.autoreset_mode is AutoresetMode.NEXT_STEP
         some_restart = is_next and bool(restarting.any())
-        if some_restart and given.shape == self.action_space.shape:
-            given = np.where(restarting[:, None], 0.0, given)
-        result = self.task.step(given)
+        if some_restart and offset.shape == self.action_space.shape:
+            offset = np.where(restarting[:, None], 0.0, offset)
+        result = self.task.step(offset)
         if some_restart:
-            result = self._restarted_instead(result, restarting)
+            result = self._restart_instead_of_step(result, restarting)
         self._done = done = result.done
         observation = result.observation
         info = result.info
         if done.any():
             if self.autoreset_mode is AutoresetMode.SAME_STEP:
-                observation, info = self._restarted_after(result)
+                observation, info = self._restart_after_step(result)
             else:
                 info["_episode_metrics"] = done.copy()
         return observation, result.reward, result.terminated, result.truncated, info
@@ -255,48 +254,47 @@ class ElasticVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]  
         }
 
     def render(self) -> tuple[Observation, ...] | None:
-        """The present picture of every world, (height, width, 3) uint8; each takes some 20 ms."""
+        """Return pictures of all worlds, (height, width, 3) uint8; each takes about 20 ms."""
         if self.render_mode is None:
             return None
         signals = self.task.signals()
         return tuple(self.picture.rgb(signals, world) for world in range(self.num_envs))
 
     def close_extras(self, **kwargs: Any) -> None:  # noqa: ARG002  Gymnasium's signature
-        """Free the renderer, let hardware go."""
-        self._let_go()
+        """Free the renderer, release the hardware."""
+        self._release()
 
-    def _begin(self, worlds: BoolArray, robots: list[int | None] | None = None) -> None:
-        seeds = robots or [None] * self.num_envs
-        self.task.restart(worlds, _episodes(self._generators, seeds))
+    def _restart(self, worlds: BoolArray, robot_seeds: list[int | None] | None = None) -> None:
+        seeds = robot_seeds or [None] * self.num_envs
+        self.task.restart(worlds, _episode_generators(self._generators, seeds))
         self._done = self._done & ~worlds
 
-    def _restarted_instead(self, result: Transition, worlds: BoolArray) -> Transition:
-        """NEXT_STEP: worlds that ended in the last step begin anew, and this one does not count."""
-        self._begin(worlds)
-        fresh = self.task.signals()
-        info = _restarted_info(result.info, worlds, fresh)
+    def _restart_instead_of_step(self, result: Transition, worlds: BoolArray) -> Transition:
+        """Restart worlds that ended in the last step, for NEXT_STEP; their step does not count."""
+        self._restart(worlds)
+        info = _info_after_reset(result.info, worlds, self.task.signals())
         terminated = result.terminated & ~worlds
         truncated = result.truncated & ~worlds
-        if not (terminated | truncated).any():  # what ended had ended before
+        if not (terminated | truncated).any():  # no other episode has ended
             info = _without_metrics(info)
         reward = np.where(worlds, 0.0, result.reward)
         return Transition(self.task.observe(), reward, terminated, truncated, info)
 
-    def _restarted_after(self, result: Transition) -> tuple[Array, Info]:
-        """SAME_STEP: the worlds that end begin anew at once.
+    def _restart_after_step(self, result: Transition) -> tuple[Array, Info]:
+        """Restart worlds that end in this step, for SAME_STEP.
 
-        Their last observation and info are kept.
+        The result's info contains their last observation and info.
         """
         done = result.done
         result.info["_episode_metrics"] = done.copy()
         final = final_of(result.observation, result.info, done)
-        self._begin(done)
-        info = _restarted_info(result.info, done, self.task.signals())
+        self._restart(done)
+        info = _info_after_reset(result.info, done, self.task.signals())
         return self.task.observe(), _without_metrics(info) | final
 
 
 def final_of(observation: Array, info: Info, done: BoolArray) -> Info:
-    """Last observation and info of worlds that end, as Gymnasium's SAME_STEP keeps them."""
+    """Last observation and info of worlds that end, in the form of Gymnasium's SAME_STEP."""
     last = np.full(len(done), None, dtype=object)
     for world in np.flatnonzero(done):
         last[world] = observation[world].copy()
@@ -304,14 +302,13 @@ def final_of(observation: Array, info: Info, done: BoolArray) -> Info:
     return {"final_obs": last, "final_info": info, **marks}
 
 
-def _episodes(
-    generators: Sequence[np.random.Generator], robots: Sequence[int | None]
+def _episode_generators(
+    generators: Sequence[np.random.Generator], robot_seeds: Sequence[int | None]
 ) -> list[EpisodeRandom]:
-    """Generators of new episodes, of new robots or of those that some seeds draw."""
-    pairs = zip(generators, robots, strict=True)
+    """Generators of new episodes; the robot comes from its seed, if there is one."""
     return [
-        EpisodeRandom(own) if seed is None else EpisodeRandom(_generator(seed), own)
-        for own, seed in pairs
+        EpisodeRandom(generator) if seed is None else EpisodeRandom(_generator(seed), generator)
+        for generator, seed in zip(generators, robot_seeds, strict=True)
     ]
 
 
@@ -328,48 +325,46 @@ def _seeds(seed: Any, num_envs: int, name: str = "seed") -> list[int | None]:
         return [None] * num_envs
     if isinstance(seed, int | np.integer):
         return [int(seed) + i for i in range(num_envs)]
-    each = list(seed) if isinstance(seed, Sequence | np.ndarray) else [seed]
-    if not all(isinstance(one, int | np.integer | None) for one in each):
+    seeds = list(seed) if isinstance(seed, Sequence | np.ndarray) else [seed]
+    if not all(isinstance(value, int | np.integer | None) for value in seeds):
         needed = f"a whole number, one per world ({num_envs}), or None"
         raise ConfigurationError(f"{name} must be {needed}; got {quote(seed)}")
-    if len(each) != num_envs:
+    if len(seeds) != num_envs:
         needed = f"must have one seed per world, {num_envs}"
-        raise ConfigurationError(f"a list of seeds {needed}, got {len(each)}")
-    return [None if one is None else int(one) for one in each]
+        raise ConfigurationError(f"a list of seeds {needed}, got {len(seeds)}")
+    return [None if value is None else int(value) for value in seeds]
 
 
 def reset_mask(options: Info | None, num_envs: int) -> BoolArray:
-    """Worlds that a reset begins anew: those of options["reset_mask"], or all.
+    """Worlds that a reset restarts: options["reset_mask"], or all.
 
     Raises:
-        ConfigurationError: The mask is no truth value per world.
+        ConfigurationError: The mask does not contain one truth value per world.
     """
     mask = (options or {}).get("reset_mask", np.ones(num_envs, dtype=np.bool_))
-    given = np.asarray(mask)
-    if given.dtype != np.bool_ or given.shape != (num_envs,):
+    values = np.asarray(mask)
+    if values.dtype != np.bool_ or values.shape != (num_envs,):
         needed = f"an array of {num_envs} booleans, one per world"
         raise ConfigurationError(f"options['reset_mask'] must be {needed}, got {quote(mask)}")
-    return given
+    return values
 
 
-def _restarted_info(info: Info, worlds: BoolArray, fresh: Signals) -> Info:
-    """The info of a step in which some worlds begin anew: theirs is that of the reset."""
-    terms = info["reward_terms"]
-    new = {**fresh, "termination": "", "clipped": 0.0}
-    changed = {key: np.where(worlds, value, info[key]) for key, value in new.items()}
-    reset_terms = {key: np.where(worlds, 0.0, term) for key, term in terms.items()}
-    return info | changed | {"reward_terms": reset_terms}
+def _info_after_reset(info: Info, worlds: BoolArray, signals: Signals) -> Info:
+    """Info of a step in which some worlds restart: they have the values of the reset."""
+    reset = {**signals, "termination": "", "clipped": 0.0}
+    values = {key: np.where(worlds, value, info[key]) for key, value in reset.items()}
+    terms = {key: np.where(worlds, 0.0, term) for key, term in info["reward_terms"].items()}
+    return info | values | {"reward_terms": terms}
 
 
 def _without_metrics(info: Info) -> Info:
-    """The info of a step in which no episode has ended."""
-    of_the_end = ("episode_metrics", "_episode_metrics")
-    return {key: value for key, value in info.items() if key not in of_the_end}
+    """Info without the entries of the end of an episode."""
+    return {key: info[key] for key in info if key.removeprefix("_") != "episode_metrics"}
 
 
-def _first(info: Info) -> Info:
-    """The info of the only world, with Python scalars."""
+def _info_of_one(info: Info) -> Info:
+    """Info of the only world, with Python scalars."""
     return {
-        key: _first(value) if isinstance(value, dict) else value[0].item()
+        key: _info_of_one(value) if isinstance(value, dict) else value[0].item()
         for key, value in info.items()
     }

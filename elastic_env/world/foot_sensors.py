@@ -1,16 +1,15 @@
-r"""Six-axis force-torque sensors of the feet: what they carry, and errors beside their noise.
+r"""Six-axis force-torque sensors of the feet: their load, and their errors in addition to noise.
 
-A sensor at the ankle measures what the foot passes on to the leg: the ground's force less the
-weight of the foot itself, (f, n) about the ankle, in the frame of the foot.
+A sensor at the ankle measures the wrench of the foot on the leg: force and moment of the ground
+minus the weight of the foot itself, (f, n) about the ankle, in the frame of the foot.
 
-A foot's sensor shows its wrench w = (f, n) with a constant bias b, a drift of rate d, and
-cross-talk:
+It measures this wrench w = (f, n) with a constant bias b, a drift of rate d, and cross-talk:
 
-.. math:: w_{shown} = w + b + d \, t + S C S^{-1} w
+.. math:: w_{measured} = w + b + d \, t + S C S^{-1} w
 
-C has zeros on its diagonal. Its other entries are shares of the full scale, as data sheets have
-them: that many of the range of one axis show at full load on another one. S holds the ranges of the
-axes, of which only the ratio of moments to forces counts.
+C has zeros on its diagonal. Its other entries are shares of the full scale, as in data sheets: the
+reading of one axis, over its range, at full load on another axis. S contains the ranges of the
+axes; only the ratio of moments to forces counts.
 """
 
 from typing import Any
@@ -22,21 +21,21 @@ from elastic_env.core.signals import Array
 from elastic_env.rigid.biped import Biped
 
 _RANGE_RATIO_M = 0.04
-"""Range of the moments over that of the forces [m]: 8 N·m over 200 N of a six-axis sensor as it is
-sold (RealMan), 120 N·m over 2800 N of the name of an ATI Mini58-SI-2800-120."""
+"""Range of the moments over the range of the forces [m]: 8 N·m over 200 N for a commercial six-axis
+sensor (RealMan), 120 N·m over 2800 N for an ATI Mini58-SI-2800-120, by its name."""
 
 
 class FootSensors:
     """Force-torque sensors at the ankles of feet that hardly accelerate.
 
     Args:
-        foot_mass: (L,) [kg].
+        foot_mass: Mass of the feet, (L,) [kg].
         foot_com: Center of mass of the feet from the ankle, in the frame of the foot, (L, 3) [m].
         gravity: Acceleration of gravity in the world, (3,) [m/s²].
 
     Attributes:
-        com: As `foot_com`.
-        weight: Of each foot, in the world, (L, 3) [N].
+        com: `foot_com`.
+        weight: Weight of each foot in the world frame, (L, 3) [N].
     """
 
     def __init__(self, foot_mass: Array, foot_com: Array, gravity: Array) -> None:
@@ -45,17 +44,17 @@ class FootSensors:
 
     @classmethod
     def of_biped(cls, biped: Biped) -> "FootSensors":
-        """The force-torque sensors at the ankles of a biped."""
+        """Make the force-torque sensors at the ankles of a biped."""
         model = biped.rigid
         feet = biped.feet
         return cls(model.body_mass[feet], model.body_ipos[feet], model.opt.gravity)
 
 
 def cross_talk_matrix(shares: Array) -> Array:
-    """S C S⁻¹ of one sensor.
+    """Matrix S C S⁻¹ of one sensor.
 
     Args:
-        shares: Entries of C beside its diagonal by rows, (..., 30) [1].
+        shares: Entries of C outside its diagonal by rows, (..., 30) [1].
 
     Returns:
         (..., 6, 6); rows and columns are forces, then moments [1], [m], [1/m].

@@ -1,6 +1,6 @@
-"""Sensors beyond the standard set of a robot, observed where `sensors=[...]` asks for them.
+"""Sensors beyond the standard set of a robot, observed where `sensors=[...]` names them.
 
-| name | columns | unit | shows | error in `nominal`, none in `ideal` |
+| name | columns | unit | measures | error in `nominal`, none in `ideal` |
 |---|---|---|---|---|
 | `link_encoder` | a joint each | rad | q in whole counts of the motor's encoder | homing error as of the encoders |
 | `joint_torque` | a joint each | N·m | torque of spring and damper on the link | noise 0.2, offset up to 0.5 |
@@ -8,9 +8,9 @@
 
 `link_imu` of a fixed robot of one joint is declared in `elastic_env.world.joint_task`.
 
-The noise of the accelerometer is that of the 3DM-GX4-25, 1.0e-3 m/s²/√Hz (thormang3_imu_3dm_gx4,
-calib), at half the control rate of 250 Hz. That of the torque sensor is an assumption: 0.2 and 0.5
-% of 100 N·m. It is drawn anew every control step, the offset every episode.
+The accelerometer has the noise of the 3DM-GX4-25, 1.0e-3 m/s²/√Hz (thormang3_imu_3dm_gx4, calib),
+at half the control rate of 250 Hz. Noise and offset of the torque sensor are assumed: 0.2 and 0.5 %
+of 100 N·m. Noise is drawn every control step, the offset every episode.
 """  # noqa: E501
 
 from collections.abc import Callable, Mapping, Sequence
@@ -29,13 +29,13 @@ from elastic_env.world.sensors import NoiseStream, angle_of_count, quantise
 
 @dataclass(frozen=True)
 class SensorInputs:
-    """The truth that sensors need, one row per world.
+    """True quantities that sensors measure, one row per world.
 
     Attributes:
         q: Link angles, (num_worlds, n) [rad].
-        joint_torque: Of spring and damper on the links, (num_worlds, n) [N·m].
+        joint_torque: Torque of spring and damper on the links, (num_worlds, n) [N·m].
         specific_force: Acceleration of the IMU minus gravity, in its frame, (num_worlds, 3) [m/s²];
-            nan where no sensor asks for it.
+            nan where no sensor measures it.
     """
 
     q: Array
@@ -45,15 +45,16 @@ class SensorInputs:
 
 @dataclass(frozen=True)
 class Sensor:
-    """A sensor by its declaration; table, noise, offset, age and mirror image follow from it.
+    """Declaration of a sensor, which defines its columns, noise, offset, delay and mirror image.
 
     Attributes:
-        unit, meaning: Of its columns.
-        truth: What it would show without error, (num_worlds, columns).
-        axes: Names of its columns and what each is in the mirror; none where it has one per joint.
+        unit, meaning: Unit and meaning of its columns.
+        truth: Measurement without error, (num_worlds, columns).
+        axes: Names of its columns, and the sign of each in the mirror image; None for one column
+            per joint.
         noise: Standard deviation [unit].
         offset: Half-width of an offset that is drawn per episode [unit].
-        is_encoder: Whether it has whole counts, and the homing error of the encoders.
+        is_encoder: True for a sensor with whole counts and the homing error of the encoders.
     """
 
     unit: str
@@ -65,9 +66,8 @@ class Sensor:
     is_encoder: bool = False
 
     def group(self, name: str, joints: Mirrors) -> SignalGroup:
-        """Its columns, of a robot with these joints and what their angles are in the mirror."""
-        parts = self.axes or joints
-        return SignalGroup.of(name, self.unit, self.meaning, parts, "measured")
+        """Columns of the sensor on a robot with these joints."""
+        return SignalGroup.of(name, self.unit, self.meaning, self.axes or joints, "measured")
 
 
 SENSORS: Mapping[str, Sensor] = {
@@ -92,13 +92,13 @@ SENSORS: Mapping[str, Sensor] = {
         noise=1.0e-3 * np.sqrt(125.0),
     ),
 }
-"""Sensors by the name that `sensors=[...]` gives them."""
+"""Sensors by their names in `sensors=[...]`."""
 
 ACCELEROMETER = "accelerometer"
 
 
 def add_accelerometer(spec: mujoco.MjSpec, site: str) -> None:
-    """Give a model the sensor that `specific_force` reads, at a site."""
+    """Add the sensor of `specific_force` to a model at a site."""
     spec.add_sensor(
         name=ACCELEROMETER,
         type=mujoco.mjtSensor.mjSENS_ACCELEROMETER,
@@ -111,12 +111,12 @@ class FurtherSensors:
     """Further sensors of all worlds.
 
     Args:
-        names: Of `SENSORS`.
-        joints: The robot's joints in order, and what their angles are in the mirror, None where it
-            has none.
-        scenarios: Of every world: its `sensor_noise` scales noise and offset, and it has the
-            encoders' errors.
-        counts_per_turn: Of the encoders.
+        names: Names in `SENSORS`.
+        joints: The robot's joints in order, and the sign of each angle in the mirror image; None
+            for a robot without one.
+        scenarios: Scenario of every world: `sensor_noise` scales noise and offset, and it defines
+            the encoders' errors.
+        counts_per_turn: Counts per turn of the encoders; None for continuous encoders.
 
     Raises:
         ConfigurationError: There is no such sensor.
@@ -132,18 +132,17 @@ class FurtherSensors:
         require_known("sensor", names, SENSORS)
         self._sensors = {name: SENSORS[name] for name in names}
         n = len(scenarios)
-        count_rad = angle_of_count(counts_per_turn)
-        self._homing_rad = [own.homing_width_rad for own in scenarios]
-        self._scale = np.array([[own.sensor_noise] for own in scenarios])
-        has_counts = np.array([[own.encoder_counts] for own in scenarios])
-        self._count_rad = count_rad * has_counts
+        self._homing_rad = [scenario.homing_width_rad for scenario in scenarios]
+        self._scale = np.array([[scenario.sensor_noise] for scenario in scenarios])
+        has_counts = np.array([[scenario.encoder_counts] for scenario in scenarios])
+        self._count_rad = angle_of_count(counts_per_turn) * has_counts
         groups = [sensor.group(name, joints) for name, sensor in self._sensors.items()]
         self.signals = SignalTable.of(groups).signals
-        """Their columns of the observation, in order."""
+        """Columns of the sensors in the observation, in order."""
         fields = [(group.name, np.float64, group.shape) for group in groups]
         self._noise = NoiseStream(n, np.dtype(fields)) if names else None  # pyright: ignore[reportArgumentType]
         self._offset = {group.name: np.zeros((n, *group.shape)) for group in groups}
-        self._now = self._before = np.zeros((n, len(self.signals)))
+        self._values = self._last_values = np.zeros((n, len(self.signals)))
 
     def restart(
         self, worlds: BoolArray, random: Sequence[EpisodeRandom], truth: SensorInputs
@@ -160,25 +159,22 @@ class FurtherSensors:
                 offset[:] = width * random[world].robot.uniform(-1.0, 1.0, len(offset))
             self._noise.restart(world, random[world].noise())
         self.measure(worlds, truth)
-        self._before = np.where(worlds[:, None], self._now, self._before)
+        self._last_values = np.where(worlds[:, None], self._values, self._last_values)
 
     def measure(self, worlds: BoolArray, truth: SensorInputs) -> None:
-        """Take new values in some worlds; the others keep theirs."""
+        """Measure new values in some worlds; the other worlds keep their values."""
         if self._noise is None:
             return
-        drawn = self._noise.next(worlds)
-        shown = []
+        noise = self._noise.next(worlds)
+        columns = []
         for name, sensor in self._sensors.items():
             value = sensor.truth(truth) + self._offset[name]
-            error = self._scale * sensor.noise * drawn[name]
-            counts = self._count_rad
-            shown.append(quantise(value, counts) if sensor.is_encoder else value + error)
-        self._before = self._now
-        self._now = np.where(worlds[:, None], np.hstack(shown), self._now)
+            error = self._scale * sensor.noise * noise[name]
+            is_encoder = sensor.is_encoder
+            columns.append(quantise(value, self._count_rad) if is_encoder else value + error)
+        self._last_values = self._values
+        self._values = np.where(worlds[:, None], np.hstack(columns), self._values)
 
     def columns(self, is_delayed: BoolArray) -> Array:
-        """Measurements, (num_worlds, columns).
-
-        In worlds whose measurements are delayed they are one control step old.
-        """
-        return np.where(is_delayed[:, None], self._before, self._now)
+        """Return the measurements, (num_worlds, columns), one control step old if delayed."""
+        return np.where(is_delayed[:, None], self._last_values, self._values)

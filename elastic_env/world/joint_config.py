@@ -1,4 +1,4 @@
-"""Parameters of a task of elastic joints, whatever the robot."""
+"""Parameters of a task of elastic joints, for any robot."""
 
 from typing import Any, Literal
 
@@ -14,12 +14,12 @@ from elastic_env.motion.references import Hold, Reference
 from elastic_env.world.joint_signals import ACTION_BOUND_RAD
 from elastic_env.world.scenario import Scenario, make_scenario
 
-FRICTIONS = ("coulomb_friction", "viscous_friction", "load_friction", "static_friction")
+FRICTION_FIELDS = ("coulomb_friction", "viscous_friction", "load_friction", "static_friction")
 """Parameters of an `ElasticJoint` that are friction."""
 
 
 class RewardWeights(Model):
-    """Weights of the reward terms; every term is a penalty that grows without saturating."""
+    """Weights of the reward terms; every term is a penalty that never saturates."""
 
     link_error: float = quantity("1/rad", 100.0, ge=0, le=1e6)
     """Per rad of link error: 1 at 0.01 rad [1/rad]."""
@@ -34,29 +34,29 @@ class TaskConfig(Model):
 
     scenario: Scenario = make_scenario("nominal")
     form: Literal["tendon", "rigid"] = "tendon"
-    """Elastic, or rigid for what an inelastic robot would do."""
+    """Elastic joints, or rigid joints of an inelastic robot."""
     sensors: tuple[Title, ...] = Field(default=(), max_length=16)
-    """Sensors beside the standard set, see `elastic_env.world.further_sensors`."""
+    """Sensors in addition to the standard set, see `elastic_env.world.further_sensors`."""
     control_period_s: float = quantity("s", 0.004, gt=0)
     """Time between commands [s]."""
 
-    def as_built(self, joint: ElasticJoint) -> ElasticJoint:
-        """A known joint as the plant of the scenario has it.
+    def plant_joint(self, joint: ElasticJoint) -> ElasticJoint:
+        """Return an assumed joint as it is in the plant of the scenario.
 
         Raises:
-            ConfigurationError: With more friction it passes no torque at all.
+            ConfigurationError: The joint transmits no torque because of its friction.
         """
         scenario = self.scenario
-        return self.with_friction_of_ground(joint).replace(
+        return self.with_ground_friction(joint).replace(
             stiffness=joint.stiffness * scenario.fixed_value("stiffness"),
             backlash=joint.backlash + scenario.fixed_value("backlash_rad"),
         )
 
-    def with_friction_of_ground(self, joint: ElasticJoint) -> ElasticJoint:
-        """A known joint with the share of its friction that acts."""
+    def with_ground_friction(self, joint: ElasticJoint) -> ElasticJoint:
+        """Return an assumed joint with the share of friction that acts in the scenario's ground."""
         scale = self.scenario.friction_scale
-        acting = {name: scale * getattr(joint, name) for name in FRICTIONS}
-        return joint.replace(**acting)
+        friction = {name: scale * getattr(joint, name) for name in FRICTION_FIELDS}
+        return joint.replace(**friction)
 
 
 class JointConfig(TaskConfig):
@@ -67,18 +67,18 @@ class JointConfig(TaskConfig):
     """Physics step [s]."""
     reward: RewardWeights = RewardWeights()
     action_bound_rad: float = quantity("rad", ACTION_BOUND_RAD, gt=0, lt=np.pi)
-    """Largest command offset; servos that give way far need more than the default [rad]."""
+    """Largest command offset; very soft servos need more than the default [rad]."""
 
     def _check(self) -> None:
-        set_ = {name for own in self.scenario.parts for name in own.changes}
-        acting = [name for name in WALKER_FIELDS if name in set_]
-        if acting:
-            problem = f"scenario {self.scenario.name!r} sets {', '.join(acting)}"
+        changes = {name for part in self.scenario.parts for name in part.changes}
+        walker_fields = [name for name in WALKER_FIELDS if name in changes]
+        if walker_fields:
+            problem = f"scenario {self.scenario.name!r} sets {', '.join(walker_fields)}"
             cure = "leave it out, or make a named scenario by make_scenario(name, walks=False)"
             raise ValueError(f"{problem}, which only a walker knows; {cure}")
 
     def plant(self) -> Any:
-        """The robot as it is built, and as it is known: `elastic_env.world.joint_task.JointPlant`.
+        """Make the plant with the true and the assumed robot: a `joint_task.JointPlant`.
 
         Raises:
             ConfigurationError: Its servos are too weak for the reference, or a sensor has no place.
@@ -87,12 +87,12 @@ class JointConfig(TaskConfig):
 
 
 def require_torque(reference: Reference, needed: Array, limits: Array) -> None:
-    """A reference that the servos cannot follow is an error now, not a poor result later.
+    """Refuse a reference that the servos cannot follow, which would give a poor result later.
 
     Args:
-        reference: It.
-        needed: Torque that it can need of each servo, (..., n) [N·m].
-        limits: What the servos have then, (..., n) [N·m].
+        reference: The reference.
+        needed: Torque that each servo can need, (..., n) [N·m].
+        limits: Largest torque of the servos at that moment, (..., n) [N·m].
 
     Raises:
         ConfigurationError: A servo is too weak.

@@ -1,10 +1,10 @@
 """A task of n elastic joints: the links follow a reference while the joints bend under gravity.
 
-The observation has the encoders, the reference of the coming control period, the last command, and
-the sensors that are asked for; the action is the command offset of every joint. With one joint its
-signals have plain names, with several `name.<joint>`, and `info` then has the figures of all joints
-together under the plain names: rms of the link errors, of the deflections, of the servo errors and
-of the offsets' rates, largest joint torque.
+The observation contains the encoders, the reference of the coming control period, the last command,
+and the requested sensors; the action is the command offset of every joint. The signals of one joint
+have plain names, those of several joints are `name.<joint>`. With several joints `info` has figures
+of all joints together under the plain names: rms of the link errors, deflections, servo errors and
+rates of the offsets, and the largest joint torque.
 """
 
 from collections.abc import Callable, Sequence
@@ -25,10 +25,10 @@ from elastic_env.joint.time_step import require_stable
 from elastic_env.motion.trajectory import Motion, PlanTable
 from elastic_env.rigid.tree.end_effector import EndEffector
 from elastic_env.world import control_kernels as kernels
-from elastic_env.world import rows as records
+from elastic_env.world import records
 from elastic_env.world.drawn_robot import (
-    joints_differ,
-    require_passing,
+    draws_joints,
+    require_bearable_friction,
     set_joints,
     spring_ids,
     stiffest_plant,
@@ -38,49 +38,50 @@ from elastic_env.world.joint_config import JointConfig
 from elastic_env.world.joint_signals import joint_groups
 from elastic_env.world.metrics import Metric
 from elastic_env.world.physics import DIVERGED_RAD_S
+from elastic_env.world.records import Records, Sample, single_record
 from elastic_env.world.rest_check import RestWatch
 from elastic_env.world.robot_model import RobotModel
-from elastic_env.world.rows import Records, Sample, one
 from elastic_env.world.sensors import PendulumImu, is_due
 from elastic_env.world.task import Task, spring_torque
 
 LINK_IMU = Signal("link_angle_imu", "rad", "IMU on the link", kind="measured")
 LINK_IMU_SENSOR = "link_imu"
-"""Name by which `sensors=[...]` asks for it, on a robot of one joint; its errors are those of
-the scenario's IMU.
+"""Its name in `sensors=[...]`, on a robot of one joint; its errors are the errors of the
+scenario's IMU.
 """
 
 _RIGID_NM_PER_RAD = 1e15
-"""Stiffness of a joint without a spring beside servos that give way."""
+"""Finite stiffness of a joint without a spring, on a robot whose other servos give way."""
 
-_METRICS = read_rows(Path(__file__).with_name("joint_metrics.csv"))
+_METRIC_ROWS = read_rows(Path(__file__).with_name("joint_metrics.csv"))
 
 
-def _metrics_of(robots: str) -> tuple[Metric, ...]:
-    rows = [dict[str, Any](row) for row in _METRICS]
+def _metrics_for(robots: str) -> tuple[Metric, ...]:
+    rows = [dict[str, Any](row) for row in _METRIC_ROWS]
     return tuple(Metric(**row) for row in rows if row.pop("robots") == robots)
 
 
-METRICS_OF_ONE = _metrics_of("one")
-METRICS_OF_SEVERAL = _metrics_of("several")
-METRICS_OF_TOOL = _metrics_of("end_effector")
+METRICS_OF_ONE = _metrics_for("one")
+METRICS_OF_SEVERAL = _metrics_for("several")
+METRICS_OF_TOOL = _metrics_for("end_effector")
 
 
 @dataclass(frozen=True)
 class JointPlant:
-    """The plant, and what is known of it.
+    """The plant, and the robot as it is assumed and as it really is.
 
     Attributes:
-        name: Of the robot.
-        model: Compiled, with elastic joints.
-        assumed, true: What a compensator may know, and what is; without a table of observations.
+        name: Name of the robot.
+        model: Compiled model with elastic joints.
+        assumed, true: Robot as a compensator may know it, and true robot; both without a table of
+            observations.
         form: "rigid" for a robot without springs.
         static_torque: τ_g that holds the true links, from (..., n) [rad] to (..., n) [N·m].
         torque_gradient: ∂τ_g/∂q, from (..., n) to (..., n, n) [N·m/rad].
-        motion: The reference as all joints follow it.
-        imu_arm_m: Distance of the link's IMU from the only joint, which has a horizontal axis and a
-            link that hangs at q = 0 [m]; None where there is no such IMU.
-        end_effector: Whose place and tilt are scored; None where the joints alone are.
+        motion: Reference motion of all joints.
+        imu_arm_m: Distance of the link's IMU from the only joint [m]; the joint's axis is
+            horizontal, and its link hangs at q = 0. None for a robot without such an IMU.
+        end_effector: End effector whose place and tilt are scored; None to score joints only.
     """
 
     name: str
@@ -104,13 +105,13 @@ class JointPlant:
     ) -> Array:
         """Link angles at rest without friction.
 
-        A dead band is crossed to the side to which the load pulls; a link that hangs at q = 0 hangs
-        there within it.
+        The load pulls a link to one side of its dead band. A link that hangs at q = 0 stays there
+        within its dead band.
 
         Args:
-            command: Of the servos, (..., n) [rad].
-            factor: On K, one number or (..., n) [1].
-            backlash: Dead bands, (..., n) [rad]; None for those of the true joints.
+            command: Commands of the servos, (..., n) [rad].
+            factor: Factor on K, one number or (..., n) [1].
+            backlash: Dead bands, (..., n) [rad]; None for the true joints' dead bands.
 
         Returns:
             (..., n) [rad].
@@ -154,8 +155,8 @@ class JointTask(Task):
     """Rules of a robot of elastic joints on a fixed base.
 
     Args:
-        config: Reference, scenario, sensors, rewards, periods, and the plant that they make.
-        num_worlds: How many.
+        config: Reference, scenario, sensors, rewards, periods, and the plant that follows.
+        num_worlds: Number of worlds.
 
     Raises:
         ConfigurationError: An unknown sensor, or the IMU of the link on a robot of several joints.
@@ -179,7 +180,7 @@ class JointTask(Task):
         scenario = config.scenario
         period_s = config.control_period_s
         counts = plant.true.encoder_counts_per_turn if scenario.encoder_counts else None
-        require_passing(plant.true, scenario)
+        require_bearable_friction(plant.true, scenario)
         metrics = METRICS_OF_ONE if len(joints) == 1 else METRICS_OF_SEVERAL
         if plant.end_effector is not None:
             metrics = metrics + METRICS_OF_TOOL
@@ -200,10 +201,10 @@ class JointTask(Task):
         )
         self._plant = plant
         self._joint_names = joints
-        self._true_model = plant.true.observed_by(self.observation_table)
+        self._true_model = plant.true.with_observation_table(self.observation_table)
         stiffness = plant.true.rest_stiffness(config.form)
         lag_s = plant.true.servo_lag
-        self._rests = bool((self._reference.rest >= 0).any())
+        self._has_rest_windows = bool((self._reference.rest >= 0).any())
         self._rest_watch = RestWatch(plant.static_torque, stiffness, joints, lag_s)
         self._imu = _inertial_imu(config, plant, num_worlds)
         self._imu_bias = np.zeros(num_worlds)
@@ -212,40 +213,41 @@ class JointTask(Task):
         self._schedule = _schedule(self._reference, scenario.imu.rate_hz, period_s)
         terms = records.LINK_SCORES.names or ()
         weights = {name: getattr(config.reward, name) for name in terms}
-        self._link_constants = one(
+        self._link_constants = single_record(
             records.LINK_CONSTANTS,
-            weights=one(records.LINK_SCORES, **weights),
+            weights=single_record(records.LINK_SCORES, **weights),
             imu_noise_rad=scenario.imu.noise_rad,
             imu_bias_rad=scenario.imu.bias_rad,
             imu_sine_error_rad=scenario.imu.sine_error_rad,
         )
         self._springs = spring_ids(self.model, joints, config.form)
-        self._joints_differ = joints_differ(scenario)
-        is_one = scenario.has_one_robot
-        same = draw_robots(scenario.parts, int(is_one), len(joints), [0])
-        self._robot = same[0] if is_one else None
+        self._has_drawn_joints = draws_joints(scenario)
+        has_one_robot = scenario.has_one_robot
+        robots = draw_robots(scenario.parts, int(has_one_robot), len(joints), [0])
+        self._only_robot = robots[0] if has_one_robot else None
 
     def restart(self, worlds: BoolArray, random: Sequence[EpisodeRandom]) -> None:
-        """Begin new episodes, also for the watch over windows at rest."""
+        """Begin new episodes, also for the check of windows at rest."""
         super().restart(worlds, random)
         self._rest_watch.restart(worlds)
 
     def score(self) -> None:
-        """Score further steps, and look whether the joints rest in windows at rest."""
+        """Score further steps, and check that the joints rest in windows at rest."""
         rows = slice(self._unscored, self._row + 1)
-        if self._rests and not self._rest_watch.is_said and rows.start < rows.stop:
+        is_watched = self._has_rest_windows and not self._rest_watch.has_warned
+        if is_watched and rows.start < rows.stop:
             truth = self._worlds[rows]["truth"]
             coming = self._reference.rest[np.minimum(truth["step"] + 1, self.num_steps)]
             is_last = (coming != truth["rest"]) | (truth["step"] >= self.num_steps)
-            self._rest_watch.see(truth["rest"], is_last, self._joints[rows]["truth"])
+            self._rest_watch.update(truth["rest"], is_last, self._joints[rows]["truth"])
         super().score()
 
     def masks(self, sample: Sample) -> dict[str, BoolArray]:
-        """Windows at rest of `hold`; all but standing and onset of the other references."""
+        """Mask of scored steps: windows at rest of `hold`; else all except standing and onset."""
         return {"scored": sample.worlds["truth"]["scored"]}
 
     def truth(self) -> JointTruth:
-        """State without noise, and the true parameters."""
+        """Return the state without noise, and the true parameters."""
         state = self._joints[self._row]["truth"]
         names = ("theta", "theta_dot", "q_dot", "stiffness")
         return JointTruth(
@@ -260,9 +262,9 @@ class JointTask(Task):
         n = len(self._joint_names)
         self._reference.draw(world, generator)
         parts = self.config.scenario.parts
-        robot = self._robot or draw_robot(parts, n, random.fork())
-        self._take_robot(world, robot)
-        # not used: noise follows what has always been drawn here
+        robot = self._only_robot or draw_robot(parts, n, random.fork())
+        self._set_robot(world, robot)
+        # unused numbers, which keep the noise of recorded results the same
         generator.random(n + 1)
         self._noise.restart(world, random.noise())
         self._imu_bias[world] = robot.mounting_rad[0]
@@ -271,21 +273,20 @@ class JointTask(Task):
         self._kind[world] = int(robot.is_delayed)
 
     def _place(self, worlds: BoolArray) -> None:
-        """The servos hold q_ref, the springs are already deflected."""
+        """Put the springs at their static deflection while the servos hold q_ref."""
         simulation = self.simulation
-        at = self._at
-        scenario = self.config.scenario
+        addresses = self._addresses
         model = self._true_model
         truth = self._joints[self._row]["truth"][worlds]
-        begun = np.flatnonzero(worlds).tolist()
-        if self._joints_differ:
-            for world in begun:
+        if self._has_drawn_joints:
+            for world in np.flatnonzero(worlds).tolist():
 
                 def field(name: str, world: int = world) -> Array:
                     return simulation.vary(name)[world]
 
-                links = at["q_dot"]
+                links = addresses["q_dot"]
                 robot = self._robots[world]
+                scenario = self.config.scenario
                 set_joints(field, self.model, self._springs, links, robot, scenario)
         q_ref = self._reference.motion[self._reference.plan_of_world[worlds], 0, 0]
         command = q_ref - truth["homing"]
@@ -293,14 +294,13 @@ class JointTask(Task):
         q = self._plant.rest_angle(command, factor, truth["backlash"])
         torque = self._plant.static_torque(q)
         theta = command - model.servo_compliance * torque
-        simulation.qpos[np.ix_(worlds, at["theta"])] = theta
-        simulation.qpos[np.ix_(worlds, at["q"])] = q
-        simulation.ctrl[np.ix_(worlds, at["servo"])] = command
+        simulation.qpos[np.ix_(worlds, addresses["theta"])] = theta
+        simulation.qpos[np.ix_(worlds, addresses["q"])] = q
+        simulation.ctrl[np.ix_(worlds, addresses["servo"])] = command
         for column, servo in enumerate(model.servos):
             if servo.integral_gain > 0.0:
-                integrator = self.model.actuator_actadr[at["servo"][column]]
-                held = torque[:, column] / servo.integral_gain
-                simulation.act[worlds, integrator] = held
+                integrator = self.model.actuator_actadr[addresses["servo"][column]]
+                simulation.act[worlds, integrator] = torque[:, column] / servo.integral_gain
         if self._has_sensors:
             simulation.bind("sensordata")
             simulation.refresh(worlds)
@@ -308,28 +308,29 @@ class JointTask(Task):
     def _begin_worlds(self, worlds: BoolArray) -> None:
         qpos = self.simulation.qpos
         if self._imu is not None:
-            self._imu.settle(worlds, qpos[:, self._at["q"][0]])
+            self._imu.settle(worlds, qpos[:, self._addresses["q"][0]])
         kernels.begin_links(qpos, self.simulation.qvel, self._step, self._links, worlds)
 
     def _sense_worlds(self, control: tuple[Any, ...]) -> bool:
         qpos = self.simulation.qpos
         qvel = self.simulation.qvel
         if self._imu is not None:
-            diverged = control[2] | (np.abs(qvel) > DIVERGED_RAD_S).any(axis=1)
-            q_dot = qvel[:, self._at["q_dot"][0]]
-            self._imu.advance(~diverged, qpos[:, self._at["q"][0]], q_dot)
+            is_too_fast = (np.abs(qvel) > DIVERGED_RAD_S).any(axis=1)
+            diverged = kernels.Control(*control).diverged | is_too_fast
+            q_dot = qvel[:, self._addresses["q_dot"][0]]
+            self._imu.advance(~diverged, qpos[:, self._addresses["q"][0]], q_dot)
         return kernels.sense_links(
             qpos, qvel, self._step, self._links, control, *kernels.EVERY_WORLD
         )
 
-    def _show_worlds(self, observed: Array) -> None:
+    def _observe_worlds(self, observation: Array) -> None:
         if self._imu_column >= 0:
-            shown = self._worlds[self._row]["shown"]
-            observed[:, self._imu_column] = shown["visible_imu"]
+            measured = self._worlds[self._row]["measured"]
+            observation[:, self._imu_column] = measured["visible_imu"]
 
     @property
     def _links(self) -> tuple[Any, ...]:
-        """`kernels.Links`."""
+        """Parts of `kernels.Links`."""
         angle = None if self._imu is None else self._imu.angle
         constants = self._link_constants
         return self._schedule, constants, self._imu_bias, self._imu_column, angle
@@ -337,7 +338,7 @@ class JointTask(Task):
     def _signals(self, joints: Records, worlds: Records) -> Signals:
         q_ref = joints["q_ref"]
         q = joints["q"]
-        of_joints = {
+        joint_signals = {
             "reference_angle": q_ref,
             "link_angle": q,
             "link_error": q_ref - q,
@@ -347,41 +348,41 @@ class JointTask(Task):
             "command_rate": joints["command_rate"],
         }
         if len(self._joint_names) == 1:
-            imu = worlds["shown"]["visible_imu"]
-            shown = {name: values[:, 0].copy() for name, values in of_joints.items()}
-            shown["link_angle_imu"] = imu.copy()
-            shown["link_error_imu"] = q_ref[:, 0] - imu
+            imu = worlds["measured"]["visible_imu"]
+            signals = {name: values[:, 0].copy() for name, values in joint_signals.items()}
+            signals["link_angle_imu"] = imu.copy()
+            signals["link_error_imu"] = q_ref[:, 0] - imu
         else:
-            shown = self._signals_of_several(of_joints)
+            signals = self._signals_of_several(joint_signals)
         if self._plant.end_effector is not None:
             distance, tilt = self._plant.end_effector.errors(q_ref, q)
-            shown |= {"end_effector_error": distance, "end_effector_tilt": tilt}
+            signals |= {"end_effector_error": distance, "end_effector_tilt": tilt}
         truth = worlds["truth"]
         time_s = truth["step"] * self.config.control_period_s
-        return {"time_s": time_s, **shown, "rest": truth["rest"].copy()}
+        return {"time_s": time_s, **signals, "rest": truth["rest"].copy()}
 
-    def _signals_of_several(self, of_joints: dict[str, Array]) -> Signals:
-        """Signals of every joint, and what they come to together."""
+    def _signals_of_several(self, joint_signals: dict[str, Array]) -> Signals:
+        """Signals of each joint, and of all joints together."""
         each = {
             f"{name}.{joint}": values[:, column].copy()
-            for name, values in of_joints.items()
+            for name, values in joint_signals.items()
             for column, joint in enumerate(self._joint_names)
         }
-        error = of_joints["link_error"]
-        summed = ("link_error", "deflection", "servo_error", "command_rate")
-        squared = {name: np.square(of_joints[name]) for name in summed}
+        error = joint_signals["link_error"]
+        rms_names = ("link_error", "deflection", "servo_error", "command_rate")
+        squares = {name: np.square(joint_signals[name]) for name in rms_names}
         return {
             **each,
-            **{name: np.sqrt(own.mean(axis=1)) for name, own in squared.items()},
+            **{name: np.sqrt(square.mean(axis=1)) for name, square in squares.items()},
             "link_error_lowest": error.min(axis=1),
             "link_error_highest": error.max(axis=1),
             "link_error_largest": np.abs(error).max(axis=1),
-            "joint_torque": np.abs(of_joints["joint_torque"]).max(axis=1),
+            "joint_torque": np.abs(joint_signals["joint_torque"]).max(axis=1),
         }
 
 
 def _schedule(reference: PlanTable, imu_rate_hz: float, period_s: float) -> Records:
-    """Records of `SCHEDULE`, one per step."""
+    """Records of `SCHEDULE`, one per control step."""
     rows = np.zeros(reference.num_steps + 1, records.SCHEDULE)
     rows["scored"] = reference.scored
     rows["rest"] = reference.rest
@@ -391,15 +392,15 @@ def _schedule(reference: PlanTable, imu_rate_hz: float, period_s: float) -> Reco
 
 
 def _inertial_imu(config: JointConfig, plant: JointPlant, num_worlds: int) -> PendulumImu | None:
-    """The IMU that computes its attitude, in scenarios that have one.
+    """Make the IMU that computes its attitude; None in scenarios without one.
 
     Raises:
         ConfigurationError: The robot has no place for it.
     """
     scenario = config.scenario
-    if all(own.inertial_share == 0.0 for own in scenario.parts):
+    if all(part.inertial_share == 0.0 for part in scenario.parts):
         return None
-    if any(own.inertial_share < 1.0 for own in scenario.parts):
+    if any(part.inertial_share < 1.0 for part in scenario.parts):
         raise ConfigurationError(
             f"scenario {scenario.name!r} gives only some robots an IMU that computes its attitude;"
             " only the walker supports that, set inertial_share to 0 or 1"
@@ -410,5 +411,10 @@ def _inertial_imu(config: JointConfig, plant: JointPlant, num_worlds: int) -> Pe
             " not have; choose another one, or the testbed or the walker"
         )
     gravity = float(np.linalg.norm(plant.model.opt.gravity))
-    place = (plant.imu_arm_m, gravity, config.control_period_s)
-    return PendulumImu(scenario.inertial, *place, num_worlds)
+    return PendulumImu(
+        scenario.inertial,
+        arm_m=plant.imu_arm_m,
+        gravity_m_s2=gravity,
+        period_s=config.control_period_s,
+        num_worlds=num_worlds,
+    )

@@ -1,6 +1,6 @@
-"""Scores of an episode from the samples of its steps, such as RMS and peak. One row per world.
+"""Metrics of an episode, such as RMS and peak, from the samples of its steps. One row per world.
 
-Which scores there are is listed in `robots/thormang/metrics.csv` and `world/joint_metrics.csv`.
+The metrics are listed in `robots/thormang/metrics.csv` and `world/joint_metrics.csv`.
 """
 
 from collections.abc import Mapping, Sequence
@@ -11,7 +11,7 @@ import numpy as np
 
 from elastic_env.core.compiled import compiled, compiled_part
 from elastic_env.core.signals import Array, BoolArray, IntArray, Signals
-from elastic_env.world.rows import WHOLE, record_type
+from elastic_env.world.records import WHOLE, record_type
 
 Statistic: TypeAlias = Literal["rms", "peak", "min", "max", "mean", "last", "count"]
 
@@ -20,8 +20,8 @@ Statistic: TypeAlias = Literal["rms", "peak", "min", "max", "mean", "last", "cou
 class Metric:
     """One figure of an episode: a statistic of a signal over the steps of a mask.
 
-    The name ends with its unit, as in link_error_rms_rad. The mask is "scored", "all", or one that
-    the task names.
+    The name ends with the unit, as in link_error_rms_rad. The mask `over` is "scored", "all", or a
+    mask of the task.
     """
 
     name: str
@@ -30,7 +30,7 @@ class Metric:
     over: str = "scored"
 
 
-_NEUTRAL: dict[Statistic, float] = {
+_INITIAL_VALUES: dict[Statistic, float] = {
     "rms": 0.0,
     "mean": 0.0,
     "min": np.inf,
@@ -39,24 +39,24 @@ _NEUTRAL: dict[Statistic, float] = {
     "last": np.nan,
     "count": 0.0,
 }
-"""What a statistic is before its first sample. `joined` knows a statistic by its place here."""
+"""Statistics before their first sample. `add_sample` uses their order in this mapping."""
 
 FOLD = record_type(("statistic", WHOLE), ("signal", WHOLE), ("mask", WHOLE))
-"""A metric as places in `_NEUTRAL` and in the rows of signals and masks."""
+"""A metric as indices into `_INITIAL_VALUES`, signals and masks."""
 
 
 @compiled
 def fold(folds: Any, signals: Array, masks: BoolArray, total: Array, count: IntArray) -> None:
-    """Take samples into the statistics in the order of their steps.
+    """Add samples to the statistics in the order of their steps.
 
-    The result does not depend on how many steps are taken at once.
+    The result does not depend on how the steps are divided into calls.
 
     Args:
         folds: Records of `FOLD`, (rows,).
-        signals: (signals, num_steps, num_worlds).
-        masks: Whether a sample counts, (masks, num_steps, num_worlds).
-        total: To be brought up to date, (rows, num_worlds).
-        count: Number of samples, likewise.
+        signals: Samples, (signals, num_steps, num_worlds).
+        masks: True where a sample counts, (masks, num_steps, num_worlds).
+        total: Statistics, updated in place, (rows, num_worlds).
+        count: Numbers of samples, updated in place, (rows, num_worlds).
     """
     for row in range(len(folds)):
         statistic = folds[row].statistic
@@ -66,13 +66,13 @@ def fold(folds: Any, signals: Array, masks: BoolArray, total: Array, count: IntA
             for world in range(values.shape[1]):
                 if is_sampled[step, world]:
                     before = total[row, world]
-                    total[row, world] = join_sample(statistic, before, values[step, world])
+                    total[row, world] = add_sample(statistic, before, values[step, world])
                     count[row, world] += 1
 
 
 @compiled_part
-def join_sample(statistic: int, before: float, value: float) -> float:
-    """A statistic and the next sample; a sample that is nan makes all but the last value nan."""
+def add_sample(statistic: int, before: float, value: float) -> float:
+    """Return a statistic after its next sample; nan makes every statistic nan except "last"."""
     if statistic == 0:
         return before + value * value
     if statistic == 1:
@@ -92,37 +92,37 @@ class EpisodeMetrics:
     """The metrics of a task, accumulated step by step in every world."""
 
     def __init__(self, metrics: Sequence[Metric], num_worlds: int) -> None:
-        statistics = [*_NEUTRAL]
+        statistics = [*_INITIAL_VALUES]
         self._metrics = metrics
         self._signals = [*dict.fromkeys(metric.signal for metric in metrics)]
         self._masks = [*dict.fromkeys(metric.over for metric in metrics)]
         self._folds = np.zeros(len(metrics), FOLD)
-        for row, own in zip(self._folds, metrics, strict=True):
-            row["statistic"] = statistics.index(own.statistic)
-            row["signal"] = self._signals.index(own.signal)
-            row["mask"] = self._masks.index(own.over)
-        neutral = [[_NEUTRAL[metric.statistic]] for metric in metrics]
-        self._neutral = np.tile(neutral, num_worlds)
-        self._total = self._neutral.copy()
+        for row, metric in zip(self._folds, metrics, strict=True):
+            row["statistic"] = statistics.index(metric.statistic)
+            row["signal"] = self._signals.index(metric.signal)
+            row["mask"] = self._masks.index(metric.over)
+        initial = [[_INITIAL_VALUES[metric.statistic]] for metric in metrics]
+        self._initial = np.tile(initial, num_worlds)
+        self._total = self._initial.copy()
         self._count = np.zeros(self._total.shape, dtype=np.int64)
 
     def restart(self, worlds: BoolArray) -> None:
-        """Begin new episodes in some worlds, (num_worlds,) mask."""
-        self._total[:, worlds] = self._neutral[:, worlds]
+        """Begin new episodes in some worlds, a (num_worlds,) mask."""
+        self._total[:, worlds] = self._initial[:, worlds]
         self._count[:, worlds] = 0
 
     def update(self, signals: Signals, masks: Mapping[str, BoolArray]) -> None:
-        """Take signals and masks by name, (num_steps, num_worlds) or (num_worlds,) each."""
+        """Add signals and masks by name, (num_steps, num_worlds) or (num_worlds,) each."""
         values = np.array([signals[name] for name in self._signals], dtype=np.float64)
-        sampled = np.array([masks[name] for name in self._masks])
-        steps = (-1, self._total.shape[1])
-        by_signal = values.reshape(len(values), *steps)
-        by_mask = sampled.reshape(len(sampled), *steps)
+        is_sampled = np.array([masks[name] for name in self._masks])
+        num_worlds = self._total.shape[1]
+        by_signal = values.reshape(len(values), -1, num_worlds)
+        by_mask = is_sampled.reshape(len(is_sampled), -1, num_worlds)
         fold(self._folds, by_signal, by_mask, self._total, self._count)
 
     def values(self) -> dict[str, Array]:
-        """Metrics so far, (num_worlds,) each; nan where no step was sampled."""
-        found: dict[str, Array] = {}
+        """Return the metrics so far, (num_worlds,) each; nan where no step was sampled."""
+        result: dict[str, Array] = {}
         rows = zip(self._metrics, self._total, self._count, strict=True)
         for metric, total, count in rows:
             value = total.copy()
@@ -132,5 +132,5 @@ class EpisodeMetrics:
                 value = np.sqrt(value)
             if metric.statistic != "count":
                 value[count == 0] = np.nan
-            found[metric.name] = value
-        return found
+            result[metric.name] = value
+        return result

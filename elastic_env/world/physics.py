@@ -1,9 +1,9 @@
-"""N worlds of one MuJoCo model: a thread pool for many, plain `mj_step` for one.
+"""N worlds of one MuJoCo model: a thread pool for many worlds, plain `mj_step` for one.
 
-The results are the same bit for bit.
+Both give the same results bit for bit.
 
-Arrays are (num_worlds, ...) views of the live state. All sub-steps of a control period are one
-call.
+Arrays are (num_worlds, ...) views of the live state. One call makes all sub-steps of a control
+period.
 """
 
 import copy
@@ -23,9 +23,9 @@ from elastic_env.joint.varying_friction import VaryingFriction
 
 
 class Simulation(Protocol):
-    """The physics of a task.
+    """Physics of a task.
 
-    The state arrays are live views; writing `ctrl` commands the next advance.
+    The state arrays are live views; values written to `ctrl` command the next advance.
     """
 
     model: MjModel
@@ -36,28 +36,27 @@ class Simulation(Protocol):
     ctrl: Array
 
     def bind(self, field: str) -> Array:
-        """A live (num_worlds, ...) view of a field of `MjData`.
+        """Return a live (num_worlds, ...) view of a field of `MjData`.
 
         Inputs such as `xfrc_applied` can be written. Derived fields and sensors lag one physics
-        step behind the state, as after `mj_step`; they are filled by the calls after they were
-        first bound, so bind them before `refresh`.
+        step behind the state, as after `mj_step`. Only calls after the first `bind` fill them, so
+        bind them before `refresh`.
         """
         ...
 
     def views(self, fields: tuple[str, ...]) -> tuple[Array, ...]:
-        """Several fields bound."""
+        """Bind several fields."""
         ...
 
     def vary(self, field: str) -> Array:
-        """A live (num_worlds, ...) array of a field of `MjModel`, from now on each world's own."""
+        """Return a live (num_worlds, ...) array of a field of `MjModel`, one row per world."""
         ...
 
-    def take(self, world: int, model: MjModel) -> None:
-        """Give a world a model of its own, in place of varied fields.
+    def set_model(self, world: int, model: MjModel) -> None:
+        """Replace the model of a world, including its varied fields.
 
-        It must have as many bodies, joints and sensors.
-
-        The state of the world stays.
+        The model must have the same numbers of bodies, joints and sensors. The state of the world
+        stays.
         """
         ...
 
@@ -70,34 +69,34 @@ class Simulation(Protocol):
         ...
 
     def restart(self, worlds: BoolArray) -> None:
-        """Set some worlds, a (num_worlds,) mask, to the model's defaults.
+        """Reset some worlds, a (num_worlds,) mask, to the model's defaults.
 
         Write their state afterwards.
         """
         ...
 
     def divergence(self) -> BoolArray:
-        """Worlds with a bad number in state, acceleration or control since their restart.
+        """Mask of worlds with a bad number in state, acceleration or control since their restart.
 
-        A (num_worlds,) mask.
+        The mask has the shape (num_worlds,).
         """
         ...
 
     def close(self) -> None:
-        """Give back what it holds; hardware loses its torque."""
+        """Release all resources; hardware switches its torque off."""
         ...
 
 
 DIVERGED_RAD_S = 1e3
-"""Speed of a joint beyond anything physical [rad/s]: two hundred times the no-load speed of the
+"""Speed of a joint that counts as divergence [rad/s]: two hundred times the no-load speed of the
 servos.
 """
 
-_BAD = [
+_BAD_NUMBERS = [
     int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{quantity}"))
     for quantity in ("QPOS", "QVEL", "QACC", "CTRL")
 ]
-_OTHERS = {
+_MODEL_FAULTS = {
     "INERTIA": "a nearly singular inertia matrix: look at the inertias of its bodies",
     "CONTACTFULL": 'too many contacts for its memory: enlarge <size memory="..."/>',
     "CNSTRFULL": 'too many constraints for its memory: enlarge <size memory="..."/>',
@@ -105,15 +104,15 @@ _OTHERS = {
 
 
 class Worlds(Simulation):
-    """Bound fields, warnings and varying friction of both simulations."""
+    """Bound fields, warnings and varying friction of all simulations with MuJoCo."""
 
     _counts: IntArray
     """Numbers of all warnings, (num_worlds, kinds)."""
-    _said: set[str]
-    """Warnings of MuJoCo that were passed on, once."""
+    _warned: set[str]
+    """Warnings of MuJoCo that were already repeated to the user."""
     _views: dict[tuple[str, ...], tuple[Array, ...]]
     _friction: VaryingFriction | None
-    """Friction that is set before every physics step; None where it does not vary."""
+    """Friction that changes before every physics step; None for constant friction."""
 
     @override
     def advance(self, num_substeps: int) -> None:
@@ -121,14 +120,14 @@ class Worlds(Simulation):
             self._step(num_substeps)
             return
         for _ in range(num_substeps):
-            self._rub(self._friction)
+            self._set_friction(self._friction)
             self._step(1)
 
     @override
     def refresh(self, worlds: BoolArray) -> None:
         if worlds.any():
             if self._friction is not None:
-                self._rub(self._friction)
+                self._set_friction(self._friction)
             self._forward(worlds)
 
     def _step(self, num_substeps: int) -> None:
@@ -138,11 +137,11 @@ class Worlds(Simulation):
         raise NotImplementedError
 
     def _field(self, name: str) -> Array:
-        """A field of the models, (num_worlds, ...) or (1, ...)."""
+        """Return a field of the models, (num_worlds, ...) or (1, ...)."""
         raise NotImplementedError
 
-    def _rub(self, friction: VaryingFriction) -> None:
-        """Set the friction of all worlds by their states."""
+    def _set_friction(self, friction: VaryingFriction) -> None:
+        """Set the friction of all worlds from their states."""
         limits = friction.limits(self._field, self.bind)
         self.vary("dof_frictionloss")[:, friction.links] = limits
 
@@ -157,13 +156,13 @@ class Worlds(Simulation):
         counts = self._counts
         if not np.count_nonzero(counts):
             return np.zeros(len(counts), dtype=np.bool_)
-        is_bad = np.asarray(counts[:, _BAD].any(axis=1))
-        # what explodes has every fault
+        is_bad = np.asarray(counts[:, _BAD_NUMBERS].any(axis=1))
+        # a world that diverges has all other faults too
         others = np.asarray(counts[~is_bad].any(axis=0))
-        for kind, meaning in _OTHERS.items():
+        for kind, meaning in _MODEL_FAULTS.items():
             number = int(getattr(mujoco.mjtWarning, f"mjWARN_{kind}"))
-            if others[number] and kind not in self._said:
-                self._said.add(kind)
+            if others[number] and kind not in self._warned:
+                self._warned.add(kind)
                 problem = f"MuJoCo goes on, less exact; the model has {meaning}"
                 warnings.warn(problem, stacklevel=2)
         return is_bad
@@ -178,12 +177,12 @@ class SingleWorld(Worlds):
 
     num_worlds = 1
 
-    def __init__(self, model: MjModel, given: MjData | None = None) -> None:
-        data: MjData = given or MjData(model)
+    def __init__(self, model: MjModel, state: MjData | None = None) -> None:
+        data: MjData = state or MjData(model)
         self.model = model
         self._data = data
-        self._said = set()
-        self._is_own = False
+        self._warned = set()
+        self._has_own_model = False
         self._counts = data.warning.number[None]
         self._views = {}
         self._friction = VaryingFriction.of(model)
@@ -193,13 +192,13 @@ class SingleWorld(Worlds):
         self.ctrl = data.ctrl[None]
 
     def __getstate__(self) -> dict[str, Any]:
-        """Everything but the live views, for `copy.deepcopy` and pickle."""
-        own = {"_said": self._said, "_is_own": self._is_own}
-        return {"made": (self.model, self._data), "own": own}
+        """Return everything except the live views, for `copy.deepcopy` and pickle."""
+        attributes = {"_warned": self._warned, "_has_own_model": self._has_own_model}
+        return {"arguments": (self.model, self._data), "attributes": attributes}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__init__(*state["made"])
-        vars(self).update(state["own"])
+        self.__init__(*state["arguments"])
+        vars(self).update(state["attributes"])
 
     @override
     def bind(self, field: str) -> Array:
@@ -207,17 +206,17 @@ class SingleWorld(Worlds):
 
     @override
     def vary(self, field: str) -> Array:
-        if not self._is_own:
+        if not self._has_own_model:
             self.model = copy.copy(self.model)
-            self._is_own = True
+            self._has_own_model = True
         return getattr(self.model, field)[None]
 
     @override
-    def take(self, world: int, model: MjModel) -> None:
+    def set_model(self, world: int, model: MjModel) -> None:
         self.model = model
 
     def model_of(self, world: int) -> MjModel:  # noqa: ARG002  there is one
-        """The model of a world with all that is its own, for reading."""
+        """Return the model of a world with its own parameters, for reading."""
         return self.model
 
     @override
@@ -244,10 +243,10 @@ class ManyWorlds(Worlds):
     def __init__(self, model: MjModel, num_worlds: int, num_threads: int = 0) -> None:
         self.model = model
         self.num_worlds = num_worlds
-        self._said = set()
+        self._warned = set()
         self._process = os.getpid()
         self._own_models: list[MjModel] | None = None
-        self._are_given = True
+        self._has_new_models = False
         self._varied: set[str] = set()
         self._bound: set[str] = set()
         self._views = {}
@@ -261,11 +260,11 @@ class ManyWorlds(Worlds):
         self.ctrl = self._batch.bind("ctrl")
 
     def __getstate__(self) -> dict[str, Any]:
-        """State without live views and threads, for copies, pickle, and a forked process."""
+        """Return the state without live views and threads: for copies, pickle, a forked process."""
         return {
-            "made": (self.model, self.num_worlds, self._batch.nthread),
-            "said": self._said,
-            "own": self._own_models,
+            "arguments": (self.model, self.num_worlds, self._batch.nthread),
+            "warned": self._warned,
+            "models": self._own_models,
             "bound": self._bound,
             "varied": {field: self.vary(field).copy() for field in self._varied},
             "state": self._batch.state.copy(),
@@ -273,10 +272,10 @@ class ManyWorlds(Worlds):
         }
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__init__(*state["made"])
-        self._said = state["said"]
-        self._own_models = state["own"]
-        self._are_given = state["own"] is None
+        self.__init__(*state["arguments"])
+        self._warned = state["warned"]
+        self._own_models = state["models"]
+        self._has_new_models = state["models"] is not None
         for field, values in state["varied"].items():
             self.vary(field)[:] = values
         for field in state["bound"]:
@@ -284,19 +283,19 @@ class ManyWorlds(Worlds):
         self._batch.state[:] = state["state"]
         self._batch.warning[:] = state["warning"]
 
-    def _ready(self) -> batch.Batch:
-        """The batch with the models of its worlds, and threads of this process.
+    def _ready_batch(self) -> batch.Batch:
+        """Return the batch with the models of its worlds and with threads of this process.
 
-        A fork leaves the threads of the parent.
+        A forked process does not have the threads of its parent.
         """
         if self._process != os.getpid():
             inherited = self._batch
-            # its end would wait for threads that are not there: it is never freed
+            # never free it: its destructor would wait for threads that do not exist
             ctypes.pythonapi.Py_IncRef(ctypes.py_object(inherited))
             self.__setstate__(self.__getstate__())
-        if not self._are_given:
+        if self._has_new_models:
             self._batch.set_models(self._own_models)
-            self._are_given = True
+            self._has_new_models = False
         return self._batch
 
     @override
@@ -310,56 +309,56 @@ class ManyWorlds(Worlds):
         return self._batch.expand(field)
 
     @override
-    def take(self, world: int, model: MjModel) -> None:
+    def set_model(self, world: int, model: MjModel) -> None:
         if self._own_models is None:
             self._own_models = [self.model] * self.num_worlds
         self._own_models[world] = model
-        self._are_given = False
+        self._has_new_models = True
 
     def model_of(self, world: int) -> MjModel:
-        """The model of a world with all that is its own, for reading."""
-        return self._ready().get_model(world)
+        """Return the model of a world with its own parameters, for reading."""
+        return self._ready_batch().get_model(world)
 
     @override
     def _field(self, name: str) -> Array:
-        is_own = name in self._varied
-        return self.vary(name) if is_own else getattr(self.model, name)[None]
+        is_varied = name in self._varied
+        return self.vary(name) if is_varied else getattr(self.model, name)[None]
 
     @override
     def _step(self, num_substeps: int) -> None:
-        self._ready().step(nstep=num_substeps)
+        self._ready_batch().step(nstep=num_substeps)
 
     @override
     def restart(self, worlds: BoolArray) -> None:
         if worlds.any():
-            self._ready().reset(worlds, stage=int(mujoco.mjtStage.mjSTAGE_NONE))
+            self._ready_batch().reset(worlds, stage=int(mujoco.mjtStage.mjSTAGE_NONE))
 
     @override
     def _forward(self, worlds: BoolArray) -> None:
-        self._ready().forward(worlds)
+        self._ready_batch().forward(worlds)
 
 
 def simulate(model: MjModel, num_worlds: int, num_threads: int = 0) -> Simulation:
-    """The fastest simulation for a number of worlds.
+    """Make the fastest simulation for a number of worlds.
 
     Args:
-        model: The model of every world.
-        num_worlds: How many.
+        model: Model of every world.
+        num_worlds: Number of worlds.
         num_threads: Threads for many worlds, 0 for all cores; the results do not depend on it.
     """
-    is_one = num_worlds == 1
-    return SingleWorld(model) if is_one else ManyWorlds(model, num_worlds, num_threads)
+    return SingleWorld(model) if num_worlds == 1 else ManyWorlds(model, num_worlds, num_threads)
 
 
 MOST_SUBSTEPS = 1000
+"""Largest number of physics steps in a control period."""
 
 
 def substeps(control_period_s: float, timestep_s: float) -> int:
     """Physics steps in a control period.
 
     Raises:
-        ConfigurationError: The control period is no multiple of the physics step, or holds too many
-            of them.
+        ConfigurationError: The control period is no multiple of the physics step, or contains too
+            many of them.
     """
     ratio = control_period_s / timestep_s
     if ratio > MOST_SUBSTEPS:

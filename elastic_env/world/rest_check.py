@@ -1,4 +1,4 @@
-"""A warning where joints move while they are scored at rest."""
+"""Warning for joints that move while they are scored at rest."""
 
 import warnings
 from collections.abc import Callable, Sequence
@@ -7,32 +7,33 @@ from itertools import pairwise
 import numpy as np
 
 from elastic_env.core.signals import Array, BoolArray, IntArray
-from elastic_env.world.rows import Records
+from elastic_env.world.records import Records
 
-_SHARE = 0.004
-"""Motion within a window that is worth a word, over the sag.
+_MOTION_PER_SAG = 0.004
+"""Smallest motion within a window that causes a warning, over the sag [1].
 
-An error of 2 % that fades by 1/s moves by as much.
+An error of 2 % of the sag that decays at 1/s moves by as much.
 """
 _SMALLEST_RAD = 1e-5
-"""Motion that is worth no word, even where a robot does not sag."""
-_SLOW_S = 0.15
-"""Lag of a servo with which it does not rest within the usual 1.5 s [s]."""
-_LAGS = 8.0
-"""Lags after which a servo is as near as 0.03 % of its way."""
+"""Smallest motion that causes a warning where a robot does not sag [rad]."""
+_SLOW_LAG_S = 0.15
+"""Lag of a servo that does not come to rest within the usual 1.5 s [s]."""
+_LAGS_TO_REST = 8.0
+"""Lags after which a servo has 0.03 % of its way left [1]."""
 
 
 class RestWatch:
-    """Warns once where links still move in a window at rest, and no policy moves them.
+    """Warn once if links still move in a window at rest, and no policy moves them.
 
     Attributes:
-        is_said: Whether it has warned.
+        has_warned: True after the warning.
 
     Args:
         static_torque: τ_g that holds the links, from (..., n) [rad] to (..., n) [N·m].
-        stiffness: Of spring and servo together, (n,) [N·m/rad].
+        stiffness: Stiffness of spring and servo in series, (n,) [N·m/rad].
         joints: Names of the joints.
-        servo_lag: k_v/k_p of their servos, with which a damped one creeps to its command, (n,) [s].
+        servo_lag: k_v/k_p of the servos, the time in which a damped servo creeps to its command,
+            (n,) [s].
     """
 
     def __init__(
@@ -46,7 +47,7 @@ class RestWatch:
         self._stiffness = stiffness
         self._joints = list(joints)
         self._servo_lag = servo_lag
-        self.is_said = False
+        self.has_warned = False
         self._window: IntArray = np.empty(0, dtype=np.int64)
         self._least: Array = np.empty(0)
         self._most: Array = np.empty(0)
@@ -56,12 +57,12 @@ class RestWatch:
         if self._window.shape == worlds.shape:
             self._window[worlds] = -1
 
-    def see(self, rest: IntArray, is_last: BoolArray, joints: Records) -> None:
-        """Look at control steps; how many are seen at once makes no difference.
+    def update(self, rest: IntArray, is_last: BoolArray, joints: Records) -> None:
+        """Check control steps; the result does not depend on how they are divided into calls.
 
         Args:
             rest: Number of the window at rest, −1 elsewhere, (steps, num_worlds).
-            is_last: Whether the window ends with a step, (steps, num_worlds).
+            is_last: True where the window ends with a step, (steps, num_worlds).
             joints: Truth of the joints, (steps, num_worlds, n).
         """
         if self._window.shape != rest.shape[1:]:
@@ -75,36 +76,38 @@ class RestWatch:
                 self._window = window.copy()
                 continue
             within = joints[begin:end]
-            seen = np.stack([within["q"], within["offset"]])
-            least = seen.min(axis=1)
-            most = seen.max(axis=1)
+            angles = np.stack([within["q"], within["offset"]])
+            least = angles.min(axis=1)
+            most = angles.max(axis=1)
             is_fresh = (window != self._window)[:, None]
             self._least = np.where(is_fresh, least, np.minimum(self._least, least))
             self._most = np.where(is_fresh, most, np.maximum(self._most, most))
-            ended = (window >= 0) & is_last[end - 1]
-            self._window = np.where(ended, -1, window)
-            if ended.any():
-                moved = (self._most - self._least)[:, ended]
-                self._judge(within[-1]["q_ref"][ended], moved, window[ended])
+            is_over = (window >= 0) & is_last[end - 1]
+            self._window = np.where(is_over, -1, window)
+            if is_over.any():
+                motion = (self._most - self._least)[:, is_over]
+                self._check_windows(within[-1]["q_ref"][is_over], motion, window[is_over])
 
-    def _judge(self, q_ref: Array, moved: Array, window: IntArray) -> None:
-        """Warn of windows that end.
+    def _check_windows(self, q_ref: Array, motion: Array, window: IntArray) -> None:
+        """Warn if links moved within windows that are over.
 
-        `moved` says by how much links and commands moved within them, (2, ended, n).
+        Args:
+            q_ref: Reference of the windows, (windows, n) [rad].
+            motion: Extent of the motion of links and of commands, (2, windows, n) [rad].
+            window: Numbers of the windows, (windows,).
         """
         sag = np.abs(self._static_torque(q_ref) / self._stiffness).max(axis=-1)
-        links, commands = moved.max(axis=-1)
-        least = np.maximum(_SHARE * sag, _SMALLEST_RAD)
-        restless = (links > least) & (commands < links / 2.0)
-        if not restless.any():
+        links, commands = motion.max(axis=-1)
+        least = np.maximum(_MOTION_PER_SAG * sag, _SMALLEST_RAD)
+        moves = (links > least) & (commands < links / 2.0)
+        if not moves.any():
             return
-        self.is_said = True
-        worst = int(np.argmax(np.where(restless, links, 0.0)))
-        joint = int(moved[0, worst].argmax())
+        self.has_warned = True
+        worst = int(np.argmax(np.where(moves, links, 0.0)))
+        joint = int(motion[0, worst].argmax())
         weight = f"and the weight bends the joints by {1e3 * sag[worst]:.3g} mrad"
         if sag[worst] < _SMALLEST_RAD:
-            nothing = "so that nothing is there to compensate"
-            weight = f"and no weight bends the joints, {nothing}"
+            weight = "and no weight bends the joints, so that nothing is there to compensate"
         warnings.warn(
             f"joint {self._joints[joint]!r} does not rest where it is scored at rest: at position"
             f" {window[worst] + 1} its link moves by {1e3 * links[worst]:.3g} mrad while it is"
@@ -113,11 +116,12 @@ class RestWatch:
         )
 
     def _cure(self, joint: int) -> str:
-        """Advice for a joint that does not rest: damping makes a slow servo slower."""
+        """Advice for a joint that does not rest; damping makes a slow servo slower."""
         lag_s = float(self._servo_lag[joint])
-        if lag_s < _SLOW_S:
+        if lag_s < _SLOW_LAG_S:
             return "Give the reference a longer settle_s, or joints and servos more damping"
         return (
             f"Its servo takes velocity_gain / position_gain = {lag_s:.2g} s to come near: give the"
-            f" reference a settle_s of {np.ceil(_LAGS * lag_s):g} s, or the servo less damping"
+            f" reference a settle_s of {np.ceil(_LAGS_TO_REST * lag_s):g} s, or the servo less"
+            " damping"
         )

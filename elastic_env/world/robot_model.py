@@ -24,11 +24,12 @@ STIFFNESS_KEY = "stiffness_nm_per_rad"
 """Key of K in an identification file."""
 Stiffness = float | str | Path | Sequence[float] | Array
 """A stiffness as users give it: a number, one per joint, or a file [N·m/rad]."""
-_UNLIMITED_RAD = 200.0 * np.pi
+_NO_LIMIT_RAD = 200.0 * np.pi
+"""Angle from which on a joint limit counts as none [rad]."""
 
 
-def _of_joints(parameter: str) -> Any:
-    """A property of a robot: a parameter of all its joints, (n,)."""
+def _joint_property(parameter: str) -> Any:
+    """Make a property of a robot: a parameter of all joints, (n,)."""
 
     def values(robot: "RobotModel") -> Array:
         each = [getattr(joint, parameter) for joint in robot.joints.values()]
@@ -41,42 +42,41 @@ def _of_joints(parameter: str) -> Any:
 class RobotModel:
     """A compiled rigid model and an `ElasticJoint` for each of its elastic hinges, in order.
 
-    The same type describes what the compensators assume and, in `truth()`, what the plant really
-    is.
+    The same type describes the robot that compensators assume and, in `truth()`, the true robot.
     """
 
     joints: Mapping[str, ElasticJoint]
     rigid: mujoco.MjModel
     control_period_s: float
     observation_table: SignalTable = NO_SIGNALS
-    """Columns of its observation, in order."""
+    """Columns of the observation, in order."""
 
     @property
     def joint_names(self) -> list[str]:
         """Names of the hinges, in order."""
         return list(self.joints)
 
-    stiffness = _of_joints("stiffness")
+    stiffness = _joint_property("stiffness")
     """K, (n,) [N·m/rad]."""
-    damping = _of_joints("damping")
+    damping = _joint_property("damping")
     """D, (n,) [N·m·s/rad]."""
-    rotor_inertia = _of_joints("rotor_inertia")
+    rotor_inertia = _joint_property("rotor_inertia")
     """B, (n,) [kg·m²]."""
-    backlash = _of_joints("backlash")
+    backlash = _joint_property("backlash")
     """Width of the dead bands, (n,) [rad]."""
-    coulomb_friction = _of_joints("coulomb_friction")
+    coulomb_friction = _joint_property("coulomb_friction")
     """Coulomb friction on the links, (n,) [N·m]."""
-    viscous_friction = _of_joints("viscous_friction")
+    viscous_friction = _joint_property("viscous_friction")
     """Viscous friction on the links, (n,) [N·m·s/rad]."""
-    load_friction = _of_joints("load_friction")
-    """Shares of the torques passed that are lost to dry friction, (n,) [1]."""
-    static_friction = _of_joints("static_friction")
-    """What dry friction has more at rest, (n,) [N·m]."""
-    stribeck_speed = _of_joints("stribeck_speed")
-    """Speeds by which that falls to 37 %, (n,) [rad/s]."""
+    load_friction = _joint_property("load_friction")
+    """Shares of the transmitted torques that dry friction takes, (n,) [1]."""
+    static_friction = _joint_property("static_friction")
+    """Increases of dry friction at rest, (n,) [N·m]."""
+    stribeck_speed = _joint_property("stribeck_speed")
+    """Speeds at which this increase falls to 37 %, (n,) [rad/s]."""
 
     def require_constant_friction(self, who: str) -> None:
-        """Refuse friction that changes with load or speed, for one who does not know it.
+        """Refuse friction that changes with load or speed, for a policy that does not model it.
 
         Raises:
             ConfigurationError: A joint has such friction.
@@ -88,36 +88,36 @@ class RobotModel:
                 " load_friction or static_friction; the policy 'friction' knows both"
             )
 
-    def largest_passed_torque(self, torque: Array) -> Array:
+    def largest_servo_torque(self, torque: Array) -> Array:
         """Largest torque that servos need to move links against friction, (..., n) [N·m].
 
         Args:
-            torque: What the links need, of either sign, (..., n) [N·m].
+            torque: Torque at the links, of either sign, (..., n) [N·m].
         """
         friction = self.coulomb_friction + self.static_friction
         return passed_torque(np.abs(torque), 1.0, friction, self.load_friction)
 
     def largest_torque(self, speed: Array) -> Array:
-        """Torques that the servos have at speeds, (..., n) [rad/s] to (..., n) [N·m].
+        """Largest torques of the servos at speeds, (..., n) [rad/s] to (..., n) [N·m].
 
         Raises:
             ConfigurationError: A joint has no servo.
         """
         pairs = zip(self.servos, np.moveaxis(speed, -1, 0), strict=True)
-        return np.stack([servo.largest_torque(own) for servo, own in pairs], axis=-1)
+        return np.stack([servo.largest_torque(column) for servo, column in pairs], axis=-1)
 
     def demand(self, torque: Array, speed: Array) -> tuple[Array, Array]:
-        """Torques that servos need along a motion, and those that they have then.
+        """Torques that servos need along a motion, and largest torques that they then have.
 
-        A servo drives the link against friction, with the torque that its motor has at that speed.
-        Or it holds it back; friction and back-EMF help then, and count as nothing.
+        A servo that drives the link works against friction, with its largest torque at that speed.
+        A servo that brakes the link is helped by friction and back-EMF; both are neglected.
 
         Args:
-            torque: What the links need but for friction, (..., n) [N·m].
-            speed: Of the links, (..., n) [rad/s].
+            torque: Torque at the links without friction, (..., n) [N·m].
+            speed: Speed of the links, (..., n) [rad/s].
 
         Returns:
-            Both (..., n) [N·m]; a servo that needs more than it has cannot follow.
+            Needed and largest torque, (..., n) [N·m]; a servo cannot follow where it needs more.
 
         Raises:
             ConfigurationError: A joint has no servo.
@@ -134,7 +134,7 @@ class RobotModel:
 
     @property
     def encoder_counts_per_turn(self) -> int | None:
-        """Counts of the encoders, which are all alike; None for continuous ones."""
+        """Counts per turn of the encoders, which are all the same; None for continuous ones."""
         return next(iter(self.joints.values())).encoder_counts_per_turn
 
     @property
@@ -144,16 +144,15 @@ class RobotModel:
         Raises:
             ConfigurationError: A joint has no servo.
         """
-        servos = {name: joint.servo for name, joint in self.joints.items()}
-        without = ", ".join(name for name, servo in servos.items() if servo is None)
+        without = ", ".join(name for name, joint in self.joints.items() if joint.servo is None)
         if without:
             needed = "a servo is needed on every joint"
             raise ConfigurationError(f"{needed}, but there is none on: {without}")
-        return tuple(servo for servo in servos.values() if servo is not None)
+        return tuple(joint.servo for joint in self.joints.values() if joint.servo is not None)
 
     @property
     def servo_compliance(self) -> Array:
-        """Compliance of the servos, (n,) [rad/(N·m)]: 1/k_p, 0 with an integrator."""
+        """Compliance of the servos, (n,) [rad/(N·m)]: 1/k_p; 0 for a servo with an integrator."""
         servos = [joint.servo for joint in self.joints.values()]
         sags = [bool(s and s.integral_gain == 0.0) for s in servos]
         gains = [s.position_gain if s else 1.0 for s in servos]
@@ -161,7 +160,7 @@ class RobotModel:
 
     @property
     def servo_lag(self) -> Array:
-        """k_v/k_p, (n,) [s]: a strongly damped servo takes as long; 0 without one.
+        """Lag k_v/k_p of strongly damped servos, (n,) [s]; 0 for a joint without a servo.
 
         The back-EMF of a motor damps like k_v.
         """
@@ -169,11 +168,11 @@ class RobotModel:
         return np.array([s.braking / s.position_gain if s else 0.0 for s in servos])
 
     def rest_stiffness(self, form: str, factor: Parameter = 1.0) -> Array:
-        """Spring and servo in series, as a command at rest feels them; infinite for what is rigid.
+        """Stiffness of spring and servo in series at rest; infinite where both are rigid.
 
         Args:
             form: "rigid" for a robot without springs.
-            factor: On K, one number or (..., n) [1].
+            factor: Factor on K, one number or (..., n) [1].
 
         Returns:
             (n,) or (..., n) [N·m/rad].
@@ -187,7 +186,7 @@ class RobotModel:
         return np.where(compliance > 0.0, in_series, stiffness)
 
     def with_stiffness(self, stiffness: npt.ArrayLike) -> "RobotModel":
-        """The same robot with another stiffness, one number or one per joint [N·m/rad].
+        """Return the robot with another stiffness, one number or one per joint [N·m/rad].
 
         Raises:
             ConfigurationError: The number of values does not fit, or one is not positive and
@@ -195,15 +194,15 @@ class RobotModel:
         """
         return replace(self, joints=with_stiffness(self.joints, stiffness))
 
-    def observed_by(self, table: SignalTable) -> Self:
-        """The same robot with this table of observations."""
+    def with_observation_table(self, table: SignalTable) -> Self:
+        """Return the robot with this table of observations."""
         return replace(self, observation_table=table)
 
 
 def with_stiffness(
     joints: Mapping[str, ElasticJoint], stiffness: npt.ArrayLike
 ) -> dict[str, ElasticJoint]:
-    """Joints with another stiffness, one number for all or one per joint [N·m/rad].
+    """Return joints with another stiffness, one number for all or one per joint [N·m/rad].
 
     Raises:
         ConfigurationError: The number of values does not fit, or one is not positive and finite.
@@ -216,27 +215,26 @@ def with_stiffness(
         )
     each = np.broadcast_to(values, (len(joints),))
     return {
-        name: j.replace(stiffness=float(k))
-        for (name, j), k in zip(joints.items(), each, strict=True)
+        name: joint.replace(stiffness=float(K))
+        for (name, joint), K in zip(joints.items(), each, strict=True)
     }
 
 
 def joint_ranges(model: mujoco.MjModel, joints: Sequence[str]) -> tuple[Array, Array]:
     """Lowest and highest angle of every joint, (n,) each [rad]; infinite without a limit.
 
-    A limit of more than a hundred turns, as exporters write it for a joint without one, is none.
+    Exporters write a limit of more than a hundred turns for a joint without one; it is ignored.
     """
-    at = [model.joint(name).id for name in joints]
-    limits = model.jnt_range[at]
-    is_near = np.abs(limits) < _UNLIMITED_RAD
-    limited = model.jnt_limited[at, None].astype(bool) & is_near
-    lowest, highest = np.where(limited, limits, [-np.inf, np.inf]).T
+    ids = [model.joint(name).id for name in joints]
+    limits = model.jnt_range[ids]
+    is_limited = model.jnt_limited[ids, None].astype(bool) & (np.abs(limits) < _NO_LIMIT_RAD)
+    lowest, highest = np.where(is_limited, limits, [-np.inf, np.inf]).T
     return lowest, highest
 
 
 @dataclass(frozen=True)
 class WalkerModel(RobotModel):
-    """A walker as a policy may know it, with its legs and its walk plan."""
+    """A walker as a policy may know it, including its legs and its walk plan."""
 
     biped: Biped = field(kw_only=True)
     plan: WalkPlan = field(kw_only=True)
@@ -248,23 +246,23 @@ def read_stiffness(value: Stiffness) -> "float | Array":
     Raises:
         ConfigurationError: The file does not exist or holds no identified stiffness.
     """
-    given = value
+    original = value
     value = plain_numbers(value)
     if isinstance(value, list | tuple):
         if all(type(item) in (int, float) for item in value):
             return np.asarray(value, dtype=np.float64)
-        raise ConfigurationError(f"stiffness must be numbers [N·m/rad], got {quote(given)}")
+        raise ConfigurationError(f"stiffness must be numbers [N·m/rad], got {quote(original)}")
     if isinstance(value, bool) or not isinstance(value, int | float | str | Path):
         raise ConfigurationError(
             f"stiffness must be a number [N·m/rad] or an identification file, got {quote(value)}"
         )
     try:
-        return float(value)  # pyright: ignore[reportArgumentType]  a Path is no number, which is what is asked
+        return float(value)  # pyright: ignore[reportArgumentType]  a Path raises TypeError
     except (TypeError, ValueError):
         path = Path(value)  # pyright: ignore[reportArgumentType]
     try:
         content = read_bounded(path, LARGEST_JSON)
-    except ConfigurationError:  # there is one, of a wrong kind or size
+    except ConfigurationError:  # the file exists, but has a wrong kind or size
         raise
     except (OSError, ValueError):
         needed = "stiffness must be a number [N·m/rad] or an identification file"

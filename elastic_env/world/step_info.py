@@ -1,4 +1,4 @@
-"""The info of a step, most of which nobody may ever look at."""
+"""Info of a step, computed only if somebody reads it."""
 
 import functools
 from collections.abc import Callable
@@ -6,44 +6,42 @@ from typing import Any
 
 
 class StepInfo(dict[str, Any]):
-    """A dictionary part of which is computed when it is first needed.
+    """A dictionary that computes some of its entries at first use.
 
-    Looking at a key that is given from the start costs nothing; anything else computes the rest,
-    once.
+    Reading a key of `known` costs nothing; any other access computes the rest, once.
 
     Args:
-        given: What is known.
-        rest: Makes the rest, without any of the given keys; it must not depend on when it is
-            called.
+        known: Entries that exist from the start.
+        compute_rest: Computes the other entries; the result must not depend on when it is called.
     """
 
-    __slots__ = ("_rest",)
+    __slots__ = ("_compute_rest",)
 
-    def __init__(self, given: dict[str, Any], rest: Callable[[], dict[str, Any]] | None) -> None:
-        super().__init__(given)
-        self._rest = rest
+    def __init__(self, known: dict[str, Any], compute_rest: Callable[[], dict[str, Any]]) -> None:
+        super().__init__(known)
+        self._compute_rest: Callable[[], dict[str, Any]] | None = compute_rest
 
-    def _settle(self) -> None:
-        if self._rest is not None:
-            rest = self._rest
-            self._rest = None
-            for key, value in rest().items():
+    def _complete(self) -> None:
+        if self._compute_rest is not None:
+            compute_rest = self._compute_rest
+            self._compute_rest = None
+            for key, value in compute_rest().items():
                 super().setdefault(key, value)
 
     def __missing__(self, key: str) -> Any:
-        if self._rest is None:
+        if self._compute_rest is None:
             raise KeyError(key)
-        self._settle()
+        self._complete()
         return self[key]
 
     def __contains__(self, key: object) -> bool:
         if not super().__contains__(key):
-            self._settle()
+            self._complete()
         return super().__contains__(key)
 
     def clear(self) -> None:
-        """As `dict.clear`."""
-        self._rest = None
+        """Remove all entries, including those not yet computed."""
+        self._compute_rest = None
         super().clear()
 
     def __eq__(self, other: object) -> bool:
@@ -59,20 +57,20 @@ class StepInfo(dict[str, Any]):
         return dict, (self.copy(),)
 
 
-def _when_complete(name: str) -> Callable[..., Any]:
-    """A method of dictionaries, after the rest has been computed."""
+def _completing_method(name: str) -> Callable[..., Any]:
+    """Return a method of `dict` that first computes the missing entries."""
     method: Callable[..., Any] = getattr(dict, name)
 
     @functools.wraps(method)
-    def of_all(self: StepInfo, *arguments: Any) -> Any:
-        self._settle()
+    def complete_and_call(self: StepInfo, *arguments: Any) -> Any:
+        self._complete()
         return method(self, *arguments)
 
-    return of_all
+    return complete_and_call
 
 
-_ALTERED = ("pop", "popitem", "setdefault", "__delitem__")
-_READ = ("get", "keys", "values", "items", "copy")
-_BY_OPERATORS = ("__iter__", "__reversed__", "__len__", "__repr__", "__or__")
-for _name in (*_ALTERED, *_READ, *_BY_OPERATORS):
-    setattr(StepInfo, _name, _when_complete(_name))
+_WRITERS = ("pop", "popitem", "setdefault", "__delitem__")
+_READERS = ("get", "keys", "values", "items", "copy")
+_OPERATORS = ("__iter__", "__reversed__", "__len__", "__repr__", "__or__")
+for _name in (*_WRITERS, *_READERS, *_OPERATORS):
+    setattr(StepInfo, _name, _completing_method(_name))

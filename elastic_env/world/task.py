@@ -2,8 +2,8 @@
 
     command → (physics) → truth → measured → score → observation
 
-Kernels do the arithmetic, see `elastic_env.world.control_kernels`. The last control steps stand in
-blocks of records, from which signals and metrics are made when they are needed.
+Kernels do the arithmetic, see `elastic_env.world.control_kernels`. Blocks of records hold the last
+control steps. Signals and metrics are computed from them on demand.
 """
 
 from abc import ABC, abstractmethod
@@ -34,15 +34,15 @@ from elastic_env.world.joint_signals import (
 )
 from elastic_env.world.metrics import EpisodeMetrics, Metric
 from elastic_env.world.physics import DIVERGED_RAD_S, Simulation, simulate, substeps
-from elastic_env.world.robot_model import RobotModel
-from elastic_env.world.rows import (
+from elastic_env.world.records import (
     JOINT,
     RULES,
     Records,
     Sample,
-    addresses,
-    columns_of,
+    first_columns,
+    joint_addresses,
 )
+from elastic_env.world.robot_model import RobotModel
 from elastic_env.world.scenario import Scenario
 from elastic_env.world.sensors import NoiseStream, angle_of_count
 from elastic_env.world.step_info import StepInfo
@@ -52,12 +52,11 @@ DIVERGED = "diverged"
 it silently.
 """
 
-_SCORED_ROWS = 4096
-_FEWEST_STEPS = 16
-_MOST_STEPS = 256
-"""Rows (steps of all worlds) whose signals are computed together, and how many steps that can
-be.
-"""
+_ROWS_PER_BLOCK = 4096
+"""Rows, which are steps of all worlds, whose signals are computed together."""
+_FEWEST_STEPS_PER_BLOCK = 16
+_MOST_STEPS_PER_BLOCK = 256
+"""Bounds of the control steps that are scored together."""
 
 
 class Transition(NamedTuple):
@@ -71,7 +70,7 @@ class Transition(NamedTuple):
 
     @property
     def done(self) -> BoolArray:
-        """Worlds whose episode is over."""
+        """Worlds whose episode has ended."""
         return self.terminated | self.truncated
 
 
@@ -79,26 +78,26 @@ class Task(ABC):
     """Rules of an environment.
 
     Args:
-        config: With `control_period_s`, `timestep_s` and `sensors`.
-        name: Of the robot.
-        model: Its plant, what is drawn aside.
-        assumed: What a compensator may know of it.
-        motion: What the links are to do.
-        table: What is observed, further sensors aside.
-        sensors: Names of further sensors, whose columns stand behind the others.
-        joints: In order, and what an angle of theirs is in the mirror.
-        scenarios: Of every world.
+        config: Configuration with `control_period_s`, `timestep_s` and `sensors`.
+        name: Name of the robot.
+        model: Plant of the robot without drawn parameters.
+        assumed: Robot as a compensator may know it.
+        motion: Reference motion of the links.
+        table: Signals of the observation without further sensors.
+        sensors: Names of further sensors; their columns follow the others.
+        joints: Joints in order, and the sign of each angle in the mirror image.
+        scenarios: Scenario of every world.
         metrics: Figures of an episode.
-        kinds: Of worlds: counts per turn of the encoders, None for none, and whether measurements
-            are delayed.
+        kinds: Kinds of worlds: encoder counts per turn, None for continuous encoders, and True if
+            measurements are delayed.
         action_bound_rad: Largest command offset [rad].
 
     Attributes:
-        failure_names: Reasons, beside `DIVERGED`, why an episode can be terminated.
-        world_type: Structured type of what a control step keeps of a world: truth, shown, scores.
-        noise_type: Structured type of a sample of noise.
+        failure_names: Reasons for a termination in addition to `DIVERGED`.
+        world_type: Structured type of a world's record in a control step: truth, measured, scores.
+        noise_type: Structured type of a noise sample.
         num_steps: Control steps of an episode that does not fail.
-        fewest_control_steps: The same of the shortest one.
+        fewest_control_steps: Control steps of the shortest episode that does not fail.
     """
 
     failure_names: tuple[str, ...] = ()
@@ -134,15 +133,15 @@ class Task(ABC):
         self._sensors = FurtherSensors(sensors, joints, scenarios, counts)
         self.observation_table = SignalTable((*table, *self._sensors.signals))
         self.action_table = action_table(names, action_bound_rad)
-        self.assumed_model = assumed.observed_by(self.observation_table)
+        self.assumed_model = assumed.with_observation_table(self.observation_table)
         self.metrics = metrics
         self._reference = reference
         self._has_sensors = bool(sensors)
-        own_terms = type(self).further_reward_terms
-        self._has_further_terms = own_terms is not Task.further_reward_terms
+        further_terms = type(self).further_reward_terms
+        self._has_further_terms = further_terms is not Task.further_reward_terms
         self._width = len(self.observation_table)
-        self._at = addresses(model, names)
-        self._columns = columns_of(self.observation_table, JOINT_COLUMNS)
+        self._addresses = joint_addresses(model, names)
+        self._columns = first_columns(self.observation_table, JOINT_COLUMNS)
         self._rules = _joint_rules(config.control_period_s, kinds)
         self._kind = np.zeros(num_worlds, dtype=np.int64)
         self._scenarios = scenarios
@@ -153,37 +152,37 @@ class Task(ABC):
         self._failures = (DIVERGED, *self.failure_names)
         self._no_reason = np.full(num_worlds, "", dtype="<U1")
         self._no_reason.flags.writeable = False
-        self._begun = np.zeros(num_worlds, dtype=np.bool_)
-        self._is_begun = False
+        self._has_episode = np.zeros(num_worlds, dtype=np.bool_)
+        self._all_have_episodes = False
         self._constants = (
-            *(self._at, self._columns, reference.motion, reference.plan_of_world),
+            *(self._addresses, self._columns, reference.motion, reference.plan_of_world),
             *(self._rules, self._kind, self._noise.samples, self._noise.used),
         )
-        steps = _SCORED_ROWS // num_worlds
-        self._steps_at_once = min(max(steps, _FEWEST_STEPS), _MOST_STEPS)
+        steps = _ROWS_PER_BLOCK // num_worlds
+        self._steps_per_block = min(max(steps, _FEWEST_STEPS_PER_BLOCK), _MOST_STEPS_PER_BLOCK)
         worlds = np.zeros((2, num_worlds), self.world_type)
         self._begin_block(np.zeros((2, num_worlds, len(names)), JOINT), worlds)
 
     def attach(
         self, simulation: Simulation | None, num_threads: int, is_scalar: bool = False
     ) -> None:
-        """Attach the physics, and compile all that a control step needs.
+        """Attach the physics, and compile all kernels of a control step.
 
         Hardware cannot wait for the compiler later.
 
         Args:
-            simulation: What moves instead of MuJoCo, such as hardware.
+            simulation: Replacement for MuJoCo's physics, such as hardware.
             num_threads: Threads of MuJoCo's physics, 0 for all cores; results do not depend on it.
-            is_scalar: Whether errors speak of one world, whose action has no axis of worlds.
+            is_scalar: True if error messages describe one world, whose action has no axis of
+                worlds.
         """
-        own = simulation or simulate(self.model, self.num_worlds, num_threads)
-        self.simulation = own
+        self.simulation = simulation or simulate(self.model, self.num_worlds, num_threads)
         self._is_scalar = is_scalar
         self._metrics = EpisodeMetrics(self.metrics, self.num_worlds)
-        # scoring many takes 2 ms, half a control period of hardware
+        # scoring many steps takes 2 ms, half a control period of hardware
         if simulation is not None:
-            self._steps_at_once = _FEWEST_STEPS
-        compile_now(self._rehearse)
+            self._steps_per_block = _FEWEST_STEPS_PER_BLOCK
+        compile_now(self._compile_kernels)
 
     def restart(self, worlds: BoolArray, random: Sequence[EpisodeRandom]) -> None:
         """Begin new episodes in some worlds, a (num_worlds,) mask.
@@ -191,52 +190,51 @@ class Task(ABC):
         The robots rest under zero offset, their springs deflected.
 
         Args:
-            worlds: Which.
+            worlds: Worlds that begin an episode.
             random: Generators of every world.
         """
-        simulation = self.simulation
         self.score()
-        self._take_rows(2)
-        simulation.restart(worlds)
+        self._advance_rows(2)
+        self.simulation.restart(worlds)
         self._metrics.restart(worlds)
         last = self._row - 1
-        now = self._row
-        for block in (self._joints, self._worlds):  # what samples keep stays as it is
+        present = self._row
+        for block in (self._joints, self._worlds):  # samples keep the old rows
             block[last] = block[last - 2]
-            block[now] = block[now - 2]
+            block[present] = block[present - 2]
         self._unscored = self._row + 1
         for world in np.flatnonzero(worlds).tolist():
             self._draw(world, random[world])
         self._place(worlds)
-        self._noise.make_ready()
+        self._noise.prepare()
         self._begin_worlds(worlds)
         for block in (self._joints, self._worlds):
-            block[last][worlds] = block[now][worlds]
+            block[last][worlds] = block[present][worlds]
         if self._has_sensors:
             self._sensors.restart(worlds, random, self._sensor_inputs())
-        self._begun = self._begun | worlds
-        self._is_begun = bool(self._begun.all())
+        self._has_episode = self._has_episode | worlds
+        self._all_have_episodes = bool(self._has_episode.all())
 
     def step(self, action: npt.ArrayLike) -> Transition:
-        """One control period under the actions, (num_worlds, n) [rad].
+        """Advance by one control period under the actions, (num_worlds, n) [rad].
 
         Raises:
             ActionError: Wrong shape, or a value that is not finite.
             ResetNeeded: A world has not begun an episode yet.
         """
-        if not self._is_begun:
-            missing = np.flatnonzero(~self._begun).tolist()
-            some = f", of the worlds {missing} too" if self._begun.any() else ""
+        if not self._all_have_episodes:
+            missing = np.flatnonzero(~self._has_episode).tolist()
+            some = f", of the worlds {missing} too" if self._has_episode.any() else ""
             raise ResetNeeded(f"reset() comes before the first step(){some}")
         offset, is_clipped = self._command(action)
         self._disturb()
         self.simulation.advance(self.num_substeps)
-        self._take_rows(1)
+        self._advance_rows(1)
         observation, reward, ends, is_over = self._sense(offset, is_clipped)
-        rest = partial(self._describe, self.sample())
-        info = StepInfo({"termination": self._no_reason}, rest)
+        compute_rest = partial(self._step_info, self.sample())
+        info = StepInfo({"termination": self._no_reason}, compute_rest)
         if is_over:
-            info["termination"] = self._reasons(ends)
+            info["termination"] = self._termination_reasons(ends)
             self.score()
             info["episode_metrics"] = {
                 **self._metrics.values(),
@@ -245,33 +243,33 @@ class Task(ABC):
         return Transition(observation, reward, ends[-2], ends[-1], info)
 
     def observe(self) -> Array:
-        """A fresh observation of the present state, (num_worlds, len(observation_table))."""
-        observed = np.empty((self.num_worlds, self._width))
-        kernels.show_joints(self._step, observed)
-        self._show_worlds(observed)
-        self._show_sensors(observed)
-        return observed
+        """Observe the present state, (num_worlds, len(observation_table))."""
+        observation = np.empty((self.num_worlds, self._width))
+        kernels.observe_all_joints(self._step, observation)
+        self._observe_worlds(observation)
+        self._observe_sensors(observation)
+        return observation
 
     def sample(self) -> Sample:
-        """The present control step."""
+        """Return the records of the present control step."""
         return Sample(self._joints[self._row], self._worlds[self._row])
 
     def signals(self, sample: Sample | None = None) -> Signals:
-        """Truth and scores by name, one value per row; by default of the present step."""
+        """Return truth and scores by name, one value per row; by default of the present step."""
         sample = self.sample() if sample is None else sample
         return self._signals(sample.joints["truth"], sample.worlds)
 
     def score(self) -> None:
-        """Take into the metrics the steps that are not yet.
+        """Add all unscored steps to the metrics.
 
-        The time of the call makes no difference to them.
+        The metrics do not depend on when this is called.
         """
         rows = slice(self._unscored, self._row + 1)
         shape = (rows.stop - rows.start, self.num_worlds)
         self._unscored = rows.stop
         if shape[0] <= 0:
             return
-        joints = self._joints[rows].reshape(-1, len(self._at))
+        joints = self._joints[rows].reshape(-1, len(self._addresses))
         sample = Sample(joints, self._worlds[rows].reshape(-1))
         truth = sample.worlds["truth"]
         masks = self.masks(sample)
@@ -286,56 +284,56 @@ class Task(ABC):
         )
 
     def reward_terms(self, sample: Sample) -> dict[str, Array]:
-        """Weighted terms whose sum is the reward, one value per row."""
+        """Return the weighted terms whose sum is the reward, one value per row."""
         scores = sample.worlds["scores"]
         terms = {name: scores[name].copy() for name in scores.dtype.names or ()}
         return terms | self.further_reward_terms(sample)
 
     def further_reward_terms(self, sample: Sample) -> dict[str, Array]:  # noqa: ARG002
-        """Terms that a task of one's own adds to the reward, one value per row."""
+        """Return terms that a user's task adds to the reward, one value per row."""
         return {}
 
     @abstractmethod
     def masks(self, sample: Sample) -> dict[str, BoolArray]:
-        """Rows that count in the metrics, "scored", and the parts of them that the metrics name."""
+        """Return the mask "scored" of rows that count, and the other masks of the metrics."""
 
     def robot_record(self, world: int) -> dict[str, float]:
-        """The robot of a world in figures, where robots differ; else nothing."""
-        is_one = self._scenarios[world].has_one_robot
-        return {} if is_one else self._robots[world].record()
+        """Parameters of a world's robot by name; empty where all robots are the same."""
+        has_one = self._scenarios[world].has_one_robot
+        return {} if has_one else self._robots[world].record()
 
     @abstractmethod
     def truth(self) -> Any:
-        """Noise-free state and true parameters, for rewards, metrics and the oracle."""
+        """Return the noise-free state and true parameters, for rewards, metrics and the oracle."""
 
-    # what differs from robot to robot
+    # steps that each robot implements
 
     @abstractmethod
     def _draw(self, world: int, random: EpisodeRandom) -> None:
-        """Draw robot, sensors and noise of a new episode, see `_take_robot`."""
+        """Draw robot, sensors and noise of a new episode, see `_set_robot`."""
 
     @abstractmethod
     def _place(self, worlds: BoolArray) -> None:
-        """Set the physics of some worlds to rest under zero offset."""
+        """Put the physics of some worlds at rest under zero offset."""
 
     @abstractmethod
     def _begin_worlds(self, worlds: BoolArray) -> None:
-        """Truth and measurements at the start of an episode in some worlds."""
+        """Fill truth and measurements at the start of an episode in some worlds."""
 
     @abstractmethod
     def _sense_worlds(self, control: tuple[Any, ...]) -> bool:
-        """Sense, score, end and observe a control step, `kernels.Control`; True if one ends."""
+        """Sense, score, end and observe a step by parts of `kernels.Control`; True if one ends."""
 
     @abstractmethod
-    def _show_worlds(self, observed: Array) -> None:
-        """Fill the columns of the present state that are not of the joints."""
+    def _observe_worlds(self, observation: Array) -> None:
+        """Fill the columns of the present state that are not the joints'."""
 
     @abstractmethod
     def _signals(self, joints: Records, worlds: Records) -> Signals:
-        """As `signals`, from the truth of the joints, (rows, n), and records of worlds, (rows,)."""
+        """`signals` from the truth of the joints, (rows, n), and records of worlds, (rows,)."""
 
-    def _take_robot(self, world: int, robot: DrawnRobot) -> None:
-        """Keep the robot of a world, and write what is true of its joints."""
+    def _set_robot(self, world: int, robot: DrawnRobot) -> None:
+        """Store the robot of a world, and write the true parameters of its joints."""
         self._robots[world] = robot
         truth = self._joints[self._row, world]["truth"]
         truth["homing"] = robot.homing_rad
@@ -345,56 +343,55 @@ class Task(ABC):
         truth["backlash"] = assumed.backlash + robot.backlash_rad
 
     def _disturb(self) -> None:  # noqa: B027  most robots are not pushed
-        """Apply what acts on the robot from outside during the coming control period."""
+        """Apply external forces during the coming control period."""
 
     _periods = 1.0
-    """Control periods that the last step took."""
+    """Control periods in the last step."""
 
     @property
     def _step(self) -> tuple[Any, ...]:
-        """The present step, as `kernels.step_of` takes it."""
+        """Arguments of `kernels.step_at` for the present step."""
         return (self._joints, self._worlds, self._row, *self._constants)
 
     def _command(self, action: npt.ArrayLike) -> tuple[Array, BoolArray]:
-        """Command offsets within their bounds; where an action was beyond them, (num_worlds,)."""
-        given = np.asarray(action)
-        if given.dtype.kind not in "fiub" or given.shape != self._action_shape:
-            raise self._refused(given)
-        offset = given.astype(np.float64, order="C")
+        """Command the servos; return the clipped offsets and the worlds with a clipped one."""
+        values = np.asarray(action)
+        if values.dtype.kind not in "fiub" or values.shape != self._action_shape:
+            raise self._action_error(values)
+        offset = values.astype(np.float64, order="C")
         is_clipped = np.empty(self.num_worlds, dtype=np.bool_)
-        inputs = self.simulation.ctrl
-        arrays = (offset, self._bound, is_clipped, inputs)
-        if not kernels.command(self._step, *arrays, *kernels.EVERY_WORLD):
-            raise self._refused(given.astype(np.float64))
+        arrays = (offset, self._bound, is_clipped, self.simulation.ctrl)
+        if not kernels.write_commands(self._step, *arrays, *kernels.EVERY_WORLD):
+            raise self._action_error(values.astype(np.float64))
         return offset, is_clipped
 
     def _sense(self, offset: Array, is_clipped: BoolArray) -> tuple[Array, Array, BoolArray, bool]:
-        """Observation, reward and ends of the last control step; True if an episode ends."""
+        """Return observation, reward and ends of the last step, and True if an episode ends."""
         n = self.num_worlds
-        observed = np.empty((n, self._width))
+        observation = np.empty((n, self._width))
         reward = np.empty(n)
         ends = np.empty((len(self._failures) + 2, n), dtype=np.bool_)
         diverged = self.simulation.divergence()
-        self._noise.make_ready()
+        self._noise.prepare()
         command = (offset, is_clipped, diverged, self._periods)
-        is_over = self._sense_worlds((*command, observed, reward, ends))
+        is_over = self._sense_worlds((*command, observation, reward, ends))
         if self._has_sensors:
             self._sensors.measure(~diverged, self._sensor_inputs())
-            self._show_sensors(observed)
+            self._observe_sensors(observation)
         if self._has_further_terms:
             for term in self.further_reward_terms(self.sample()).values():
                 reward += term
-        return observed, reward, ends, is_over
+        return observation, reward, ends, is_over
 
-    def _show_sensors(self, observed: Array) -> None:
+    def _observe_sensors(self, observation: Array) -> None:
         """Fill the columns of further sensors."""
         if self._has_sensors:
             is_delayed = self._rules["is_delayed"][self._kind]
             first = self._width - len(self._sensors.signals)
-            observed[:, first:] = self._sensors.columns(is_delayed)
+            observation[:, first:] = self._sensors.columns(is_delayed)
 
     def _sensor_inputs(self) -> SensorInputs:
-        """The truth that further sensors need; the specific force lags one physics step behind."""
+        """Return the truth for further sensors; the specific force lags by one physics step."""
         truth = self._joints[self._row]["truth"]
         force = np.full((self.num_worlds, 3), np.nan)
         if further.ACCELEROMETER in self.config.sensors:
@@ -402,16 +399,16 @@ class Task(ABC):
             force = self.simulation.bind("sensordata")[:, begin : begin + 3].copy()
         return SensorInputs(truth["q"].copy(), spring_torque(truth), force)
 
-    def _describe(self, sample: Sample) -> dict[str, Any]:
-        """Reward terms, signals and clipping of a step, computed when somebody looks at them."""
+    def _step_info(self, sample: Sample) -> dict[str, Any]:
+        """Reward terms, signals and clipping of a step."""
         clipped = sample.worlds["truth"]["clipped"].astype(np.float64)
         terms = self.reward_terms(sample)
         return {"reward_terms": terms, **self.signals(sample), "clipped": clipped}
 
-    def _take_rows(self, count: int) -> None:
-        """Go on to fresh records, in a fresh block where this one is full.
+    def _advance_rows(self, count: int) -> None:
+        """Advance to new records, in a new block if this one is full.
 
-        Samples may keep the old one.
+        Samples may still refer to the old block.
         """
         if self._row + count >= len(self._joints):
             self.score()
@@ -420,8 +417,8 @@ class Task(ABC):
         self._row += count
 
     def _begin_block(self, joints: Records, worlds: Records) -> None:
-        """Records for the next steps, behind those of the step before and of the present one."""
-        steps = self._steps_at_once + 2
+        """Allocate records for the next steps, after those of the last step and the present one."""
+        steps = self._steps_per_block + 2
         self._joints = np.zeros((steps, *joints.shape[1:]), JOINT)
         self._worlds = np.zeros((steps, self.num_worlds), self.world_type)
         self._joints[:2] = joints
@@ -429,15 +426,14 @@ class Task(ABC):
         self._row = 1
         self._unscored = 2
 
-    def _rehearse(self) -> None:
-        """Compile all kernels by a control step of records that nobody sees."""
+    def _compile_kernels(self) -> None:
+        """Compile all kernels by a control step whose records are discarded."""
         every = np.ones(self.num_worlds, dtype=np.bool_)
-        nothing = np.zeros((self.num_worlds, len(self._bound)))
-        offset, is_clipped = self._command(nothing)
+        offset, is_clipped = self._command(np.zeros(self._action_shape))
         self.simulation.ctrl[:] = 0.0
-        self._noise.make_ready()
+        self._noise.prepare()
         self._begin_worlds(every)
-        self._take_rows(1)
+        self._advance_rows(1)
         self._sense(offset, is_clipped)
         self.observe()
         self.score()
@@ -445,34 +441,34 @@ class Task(ABC):
         joints = np.zeros_like(self._joints[:2])
         self._begin_block(joints, np.zeros_like(self._worlds[:2]))
 
-    def _reasons(self, ends: BoolArray) -> npt.NDArray[np.str_]:
-        """Reason of termination of every world, the first that applies, "" where there is none."""
+    def _termination_reasons(self, ends: BoolArray) -> npt.NDArray[np.str_]:
+        """First reason of termination that applies in every world, "" for none."""
         longest = max(map(len, self._failures))
         reasons = np.full(self.num_worlds, "", dtype=f"<U{longest}")
         for reason, failed in reversed([*zip(self._failures, ends, strict=False)]):
             reasons[failed] = reason
         return reasons
 
-    def _refused(self, given: npt.NDArray[Any]) -> ActionError:
-        """The error that says what is wrong with an action."""
+    def _action_error(self, action: npt.NDArray[Any]) -> ActionError:
+        """Error that describes the fault of an action."""
         shape = self._action_shape
         bounds = f"within ±{self._bound.max():g} rad"
-        if given.dtype.kind not in "fiub":
-            problem = f"be real numbers, {bounds}, got an array of {given.dtype}"
-        elif given.shape != shape:
+        if action.dtype.kind not in "fiub":
+            problem = f"be real numbers, {bounds}, got an array of {action.dtype}"
+        elif action.shape != shape:
             # a scalar environment adds the axis of worlds itself
             first = int(self._is_scalar)
-            got = f"got shape {given.shape[first:]}"
+            got = f"got shape {action.shape[first:]}"
             problem = f"have shape {shape[first:]} [rad], {bounds}; {got}"
         else:
-            world = np.flatnonzero(~np.isfinite(given).all(axis=1))[0]
-            got = f"got {given[world]} in world {world}"
+            world = np.flatnonzero(~np.isfinite(action).all(axis=1))[0]
+            got = f"got {action[world]} in world {world}"
             problem = f"be finite, {bounds}, shape {shape[1:]} a world; {got}"
         return ActionError(f"an action must {problem}")
 
 
 def _joint_rules(period_s: float, kinds: Sequence[tuple[int | None, bool]]) -> Records:
-    """Records of `RULES`, one for every kind of world."""
+    """Records of `RULES`, one per kind of world."""
     rules = np.zeros(len(kinds), RULES)
     rules["control_period_s"] = period_s
     rules["count_rad"] = [angle_of_count(counts) for counts, _ in kinds]

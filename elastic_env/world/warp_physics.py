@@ -1,11 +1,10 @@
 """N worlds of one MuJoCo model on a GPU, by MuJoCo Warp.
 
-The control step stays on the CPU, and so does the state that it sees, in double precision. A step
-of the physics sends the state to the device, and reads back what was bound. The device computes in
-single precision: its worlds agree with those of `elastic_env.world.physics`, and are not the same
-bits.
+The control step and its state stay on the CPU, in double precision. A step of the physics sends the
+state to the device, and reads the bound fields back. The device computes in single precision: its
+results agree with those of `elastic_env.world.physics`, but not bit for bit.
 
-No other module imports MuJoCo Warp, which the extra `gpu` brings.
+No other module imports MuJoCo Warp, which the extra `gpu` installs.
 """
 
 import copy
@@ -30,38 +29,40 @@ try:
 except ImportError as error:
     raise missing_extra(str(error.name), "gpu", 'the backend "warp"') from None
 
-# no line per kernel
+# do not print a line per kernel
 warp.config.log_level = max(warp.config.log_level, warp.LOG_WARNING)
 
 _CONTACTS = 16
-_ROWS = 64
+_CONSTRAINT_ROWS = 64
 """Memory of a world for contacts, and for rows of constraints; a walker has up to 8 and 44."""
 _STATE = ("qpos", "qvel", "act", "qacc_warmstart")
+"""Fields of `MjData` that a step reads and changes."""
 _COMMANDS = ("ctrl", "xfrc_applied", "qfrc_applied")
-"""What a step changes, and what it only needs; all other fields of `MjData` are results."""
-_READ_HERE = ("numeric_data",)
+"""Fields of `MjData` that a step only reads; all fields not listed here are results."""
+_HOST_FIELDS = ("numeric_data",)
 """Fields of `MjModel` that the device does not need."""
-_OF_A_WORLD = {
+_WORLD_FIELDS = {
     field.name
     for field in dataclasses.fields(mujoco_warp.Model)
     if getattr(field.type, "shape", ())[:1] == ("*",)
 }
-"""Fields of models that the device can have a row of for every world."""
-_BAD = 1e10
-"""MuJoCo takes a number beyond it for a bad one."""
-_FULL = int(
+"""Fields of models that can have a row for every world on the device."""
+_LARGEST_NUMBER = 1e10
+"""MuJoCo counts larger numbers as bad."""
+_OVERFLOW_BITS = int(
     mujoco_warp.OverflowType.NEFC
     | mujoco_warp.OverflowType.BROADPHASE
     | mujoco_warp.OverflowType.NARROWPHASE
 )
 
 
-def for_warp(model: MjModel) -> MjModel:
-    """The same plant in terms that MuJoCo Warp knows.
+def warp_model(model: MjModel) -> MjModel:
+    """Return the same plant in elements that MuJoCo Warp supports.
 
-    It refuses PID actuators. A DC motor with K = R = 1 and these gains is one: its controller adds
-    K ω to the voltage, and its back-EMF takes K ω off. Both have the integral as their only state.
-    It refuses the flag that says not to restart a diverged world, which it never does.
+    MuJoCo Warp refuses PID actuators. A DC motor with K = R = 1 and these gains is equivalent: its
+    controller adds K ω to the voltage, and its back-EMF subtracts K ω. Both have the integral as
+    their only state. MuJoCo Warp also refuses the flag against restarts of diverged worlds; it
+    never restarts them.
 
     Raises:
         ConfigurationError: A PID actuator has a `slewmax`.
@@ -93,31 +94,31 @@ def for_warp(model: MjModel) -> MjModel:
 class WarpWorlds(Worlds):
     """Many worlds on a device of Warp.
 
-    An array of `vary` goes to the device once: ask for it again before every change.
+    An array of `vary` is sent to the device once: call `vary` again before every change.
 
     Args:
-        model: Of every world.
-        num_worlds: How many.
+        model: Model of every world.
+        num_worlds: Number of worlds.
         device: "cuda:0", the default, another GPU, or "cpu" for tests.
 
     Raises:
-        ConfigurationError: The device is not there, or the model has what MuJoCo Warp lacks.
+        ConfigurationError: The device does not exist, or MuJoCo Warp does not support the model.
     """
 
     def __init__(self, model: MjModel, num_worlds: int, device: str | None = None) -> None:
         self.model = model
         self.num_worlds = num_worlds
         self._device = _find_device(device or "cuda:0")
-        self._said = set()
+        self._warned = set()
         self._views = {}
         self._friction = VaryingFriction.of(model)
         warnings_known = int(mujoco.mjtWarning.mjNWARNING)
         self._counts = np.zeros((num_worlds, warnings_known), dtype=np.int64)
-        self._plant = for_warp(model)
-        self._shapes = mujoco.MjData(model)
+        self._plant = warp_model(model)
+        self._host_data = mujoco.MjData(model)
         self._bound: dict[str, Array] = {}
         self._varied: dict[str, Array] = {}
-        self._unsent: set[str] = set()
+        self._unsent_fields: set[str] = set()
         self._graph: Any = None
         with warp.ScopedDevice(self._device):
             try:
@@ -125,24 +126,25 @@ class WarpWorlds(Worlds):
             except (NotImplementedError, ValueError) as error:
                 problem = f'the backend "warp" refuses the model: {error}'
                 raise ConfigurationError(problem) from None
-            memory = {"nconmax": _CONTACTS, "njmax": _ROWS}
-            self._data = mujoco_warp.make_data(self._plant, nworld=num_worlds, **memory)
-        self._model.opt.warn_overflow = 0  # `_watch` warns
+            self._data = mujoco_warp.make_data(
+                self._plant, nworld=num_worlds, nconmax=_CONTACTS, njmax=_CONSTRAINT_ROWS
+            )
+        self._model.opt.warn_overflow = 0  # `_check_results` warns
         self.qpos, self.qvel, self.act, _ = self.views(_STATE)
         self.ctrl = self.bind("ctrl")
         self.restart(np.ones(num_worlds, dtype=np.bool_))
 
     def __getstate__(self) -> dict[str, Any]:
-        """State without what is on the device, for copies and pickle."""
+        """Return the state without arrays on the device, for copies and pickle."""
         return {
-            "made": (self.model, self.num_worlds, self._device.alias),
+            "arguments": (self.model, self.num_worlds, self._device.alias),
             "varied": self._varied,
             "bound": self._bound,
             "counts": self._counts,
         }
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__init__(*state["made"])
+        self.__init__(*state["arguments"])
         for field, values in state["varied"].items():
             self.vary(field)[:] = values
         for field, values in state["bound"].items():
@@ -152,28 +154,28 @@ class WarpWorlds(Worlds):
     @override
     def bind(self, field: str) -> Array:
         if field not in self._bound:
-            shape = getattr(self._shapes, field).shape
+            shape = getattr(self._host_data, field).shape
             self._bound[field] = np.zeros((self.num_worlds, *shape))
         return self._bound[field]
 
     @override
     def vary(self, field: str) -> Array:
-        is_sent = field not in _READ_HERE
+        is_sent = field not in _HOST_FIELDS
         if field not in self._varied:
             if is_sent:
-                self._expand(field)
-            of_plant = getattr(self._plant, field)
-            self._varied[field] = np.repeat(of_plant[None], self.num_worlds, axis=0)
+                self._expand_field(field)
+            shared = getattr(self._plant, field)
+            self._varied[field] = np.repeat(shared[None], self.num_worlds, axis=0)
         if is_sent:
-            self._unsent.add(field)
+            self._unsent_fields.add(field)
         return self._varied[field]
 
     @override
-    def take(self, world: int, model: MjModel) -> None:
-        plant = for_warp(model)
-        for name in {*_differing(model, self.model), *self._varied}:
-            # names and sizes differ too, and the device has none
-            if name in _READ_HERE or hasattr(self._model, name):
+    def set_model(self, world: int, model: MjModel) -> None:
+        plant = warp_model(model)
+        for name in {*_different_fields(model, self.model), *self._varied}:
+            # fields such as names and sizes differ too, and do not exist on the device
+            if name in _HOST_FIELDS or hasattr(self._model, name):
                 self.vary(name)[world] = getattr(plant, name)
 
     @override
@@ -189,12 +191,12 @@ class WarpWorlds(Worlds):
         with warp.ScopedDevice(self._device):
             mujoco_warp.forward(self._model, self._data)
         for name in self._bound.keys() - {*_STATE, *_COMMANDS}:
-            self._bound[name][worlds] = self._read(name)[worlds]
+            self._bound[name][worlds] = self._read_field(name)[worlds]
 
     @override
     def _field(self, name: str) -> Array:
-        is_own = name in self._varied
-        return self._varied[name] if is_own else getattr(self.model, name)[None]
+        is_varied = name in self._varied
+        return self._varied[name] if is_varied else getattr(self.model, name)[None]
 
     @override
     def _step(self, num_substeps: int) -> None:
@@ -203,11 +205,11 @@ class WarpWorlds(Worlds):
             for _ in range(num_substeps):
                 self._step_once()
         for name in self._bound.keys() - {*_COMMANDS}:
-            self._bound[name][:] = self._read(name)
-        self._watch()
+            self._bound[name][:] = self._read_field(name)
+        self._check_results()
 
     def _step_once(self) -> None:
-        """A physics step: the first one compiles, later ones repeat its launches as one graph."""
+        """Take a physics step: the first one compiles, later ones launch its kernels as a graph."""
         if self._graph is not None:
             warp.capture_launch(self._graph)
             return
@@ -216,65 +218,67 @@ class WarpWorlds(Worlds):
             mujoco_warp.step(self._model, self._data)
         self._graph = capture.graph
 
-    def _watch(self) -> None:
-        """Count bad numbers, and warn of too little memory, once."""
+    def _check_results(self) -> None:
+        """Count bad numbers, and warn once if the memory is too small."""
         state = np.concatenate([self.qpos, self.qvel], axis=1)
-        is_good = np.abs(state) < _BAD  # nan is not
+        is_good = np.abs(state) < _LARGEST_NUMBER  # false for nan
         self._counts[:, int(mujoco.mjtWarning.mjWARN_BADQPOS)] += ~is_good.all(axis=1)
-        is_full = (self._data.overflow.numpy() & _FULL) != 0
-        if "full" not in self._said and is_full[is_good.all(axis=1)].any():
-            self._said.add("full")
+        is_full = (self._data.overflow.numpy() & _OVERFLOW_BITS) != 0
+        if "full" not in self._warned and is_full[is_good.all(axis=1)].any():
+            self._warned.add("full")
             warnings.warn(
                 f'the backend "warp" goes on, less exact: a world has more than {_CONTACTS}'
-                f' contacts or {_ROWS} rows of constraints; the backend "mujoco" has no such limit',
+                f" contacts or {_CONSTRAINT_ROWS} rows of constraints; the backend"
+                ' "mujoco" has no such limit',
                 stacklevel=2,
             )
 
-    def _expand(self, field: str) -> None:
+    def _expand_field(self, field: str) -> None:
         """Give every world a row of a field of the model on the device."""
-        if field not in _OF_A_WORLD:
+        if field not in _WORLD_FIELDS:
             raise ConfigurationError(
                 f'in the backend "warp" all worlds have the same {field}; choose the backend'
                 ' "mujoco" for models that differ in it'
             )
         shared = getattr(self._model, field)
         shape = (self.num_worlds, *shared.shape[1:])
-        own = warp.empty(shape, shared.dtype, device=self._device)
-        setattr(self._model, field, own)
-        self._graph = None  # it reads the shared row
+        rows = warp.empty(shape, shared.dtype, device=self._device)
+        setattr(self._model, field, rows)
+        self._graph = None  # the old graph reads the shared row
 
     def _send(self) -> None:
-        """Bring state, commands and changed fields of models to the device."""
+        """Send state, commands and changed fields of models to the device."""
         for name in self._bound.keys() & {*_STATE, *_COMMANDS}:
             getattr(self._data, name).assign(self._bound[name].astype(np.float32))
-        for name in self._unsent:
+        for name in self._unsent_fields:
             getattr(self._model, name).assign(self._varied[name].astype(np.float32))
-        self._unsent.clear()
+        self._unsent_fields.clear()
 
-    def _read(self, field: str) -> Array:
-        """A field of the device, shaped as in MuJoCo."""
+    def _read_field(self, field: str) -> Array:
+        """Read a field from the device, in the shape that it has in MuJoCo."""
         return getattr(self._data, field).numpy().reshape(self._bound[field].shape)
 
 
 @lru_cache(maxsize=1024)
-def _differing(model: MjModel, other: MjModel) -> tuple[str, ...]:
+def _different_fields(model: MjModel, other: MjModel) -> tuple[str, ...]:
     """Names of the arrays in which two models differ."""
-    pairs = [(name, getattr(model, name), getattr(other, name)) for name in dir(model)]
-    arrays = [pair for pair in pairs if isinstance(pair[1], np.ndarray)]
-    return tuple(name for name, own, its in arrays if not np.array_equal(own, its))
+    arrays = [name for name in dir(model) if isinstance(getattr(model, name), np.ndarray)]
+    return tuple(
+        name for name in arrays if not np.array_equal(getattr(model, name), getattr(other, name))
+    )
 
 
 def _find_device(name: str) -> Any:
-    """A device of Warp by its name.
+    """Return a device of Warp by its name.
 
     Raises:
-        ConfigurationError: It is not there.
+        ConfigurationError: The device does not exist.
     """
     try:
         return warp.get_device(name)
     except ValueError:
-        found = " or ".join(f'device="{device.alias}"' for device in warp.get_devices())
+        choices = " or ".join(f'device="{device.alias}"' for device in warp.get_devices())
         raise ConfigurationError(
             f'the backend "warp" finds no device {quote(name)}, which needs CUDA, on this computer;'
-            f' choose {found}, or for speed without a GPU the backend "mujoco"'
+            f' choose {choices}, or for speed without a GPU the backend "mujoco"'
         ) from None

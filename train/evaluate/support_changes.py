@@ -77,7 +77,7 @@ class SupportChanges:
             step: Its number, 0 at the start of the episodes.
             q_estimate: Joint angles as the policy sees them, (num_worlds, 12) [rad].
             seen: Its observation, (num_worlds, m).
-            truth: True state at that time, an `elastic_env.robots.thormang.rows.WalkTruth`.
+            truth: True state at that time, an `elastic_env.robots.thormang.records.WalkTruth`.
         """
         if step not in self._changes:
             return

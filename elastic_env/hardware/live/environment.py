@@ -35,7 +35,7 @@ from elastic_env.robots.testbed.picture import TestbedPicture
 from elastic_env.world.envs import ElasticEnv, ElasticVectorEnv
 from elastic_env.world.joint_task import METRICS_OF_ONE, JointTask, JointTruth
 from elastic_env.world.metrics import Metric
-from elastic_env.world.rows import REAL, WHOLE, Records, record_type
+from elastic_env.world.records import REAL, WHOLE, Records, record_type
 from elastic_env.world.sensors import AttitudeSensor
 
 TIMING_METRICS = (

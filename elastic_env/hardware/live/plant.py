@@ -198,7 +198,7 @@ class ServoPlant:
 
     views: Any = bind
     vary: Any = bind
-    take: Any = bind
+    set_model: Any = bind
 
     def _open_bus(self) -> SupervisedBus:
         settings = self.settings

@@ -1,4 +1,4 @@
-"""`elastic_env/Robot-v0`: any robot on a fixed base, from files of its model and its joints.
+"""`elastic_env/Robot-v0`: any robot on a fixed base, from a model file and a joint file.
 
 env = gymnasium.make("elastic_env/Robot-v0", model="arm.xml", joints="arm.yaml",
 end_effector="tool")
@@ -31,7 +31,7 @@ from elastic_env.registration import Robot
 from elastic_env.rigid.tree.end_effector import outermost_body
 from elastic_env.robots.joint_robot import JointPicture, JointRobot, JointRobotConfig
 from elastic_env.robots.robot import ID, NAME
-from elastic_env.robots.robot import joints as own_joints
+from elastic_env.robots.robot import joints as assumptions
 from elastic_env.robots.robot.model import RigidModel, read_robot
 from elastic_env.world.drawn_robot import stiffest_plant
 from elastic_env.world.joint_config import RewardWeights
@@ -41,13 +41,11 @@ from elastic_env.world.physics import MOST_SUBSTEPS
 from elastic_env.world.scenario import Scenario
 
 EXAMPLE = Path(__file__).with_name("example.xml")
-"""The made-up arm that is played where no model is named; its joints are in the YAML file beside
-it.
-"""
+"""Example arm, the default model; its joints are in the YAML file of the same name."""
 
 LOAD_SHARE = 0.2
-"""Share of the mass of the joints' links that servos of unknown limits can carry: what the
-scenario `payload` adds.
+"""Load that servos of unknown limits can carry, over the mass of the model: the load of the
+scenario `payload` [1].
 """
 
 
@@ -67,31 +65,31 @@ def configure_robot(
     timestep_s: float | None = None,
     action_bound_rad: float = ACTION_BOUND_RAD,
 ) -> JointRobotConfig:
-    """The configuration from the arguments of `gymnasium.make("elastic_env/Robot-v0", ...)`.
+    """Make the configuration from the arguments of `gymnasium.make("elastic_env/Robot-v0", ...)`.
 
     Args:
-        model: File of MJCF (.xml) or URDF (.urdf), the text of one, or a `mujoco.MjSpec`; without
-            it and joints a made-up arm of four joints.
+        model: File of MJCF (.xml) or URDF (.urdf), its text, or a `mujoco.MjSpec`; without model
+            and joints an example arm of four joints.
         joints: YAML file or mapping of the elastic joints by name or pattern, see
-            `elastic_env.joint.joint_settings`. All other joints are held where the model's first
-            keyframe has them, or at its reference.
+            `elastic_env.joint.joint_settings`. All other joints are fixed at the model's first
+            keyframe, or at its reference.
         reference: "poses", "moves", "line", "circle", "sine", "multisine", "steps", "hold", a
             mapping with `kind` and parameters, such as {"kind": "csv", "file": "angles.csv"}, or a
             reference model.
         scenario: Name as in `elastic_env.world.scenario`, or a `Scenario`.
         end_effector: Site or body whose place and tilt are scored; default the outermost body.
-        home: Angle about which each joint follows the reference, by name or in order [rad]; default
-            the model's first keyframe, or its reference, within the joint ranges, or near there
-            where the servos hold it.
+        home: Angle about which each joint follows the reference, by name or in order [rad]. The
+            default is the model's first keyframe, or its reference, within the joint ranges, or a
+            near pose that the servos hold.
         load_kg: The scenario `payload` adds a fifth of this mass at the end effector [kg]; default
-            the mass of the model, its base included.
+            the mass of the model including its base.
         imu: Site of the accelerometer.
-        stiffness: K in place of that in `joints` [N·m/rad], one number or one per joint.
-        form: "tendon" for elastic joints, "rigid" for what an inelastic robot would do.
-        sensors: What is observed beside the standard set, see `elastic_env.world.further_sensors`.
-        reward: Weights of the reward terms, or a mapping of what differs from the default.
-        timestep_s: Physics step, which divides the control period of 4 ms; default 0.5 ms, or where
-            the joints explode with it the largest stable one [s].
+        stiffness: K that replaces the one in `joints` [N·m/rad], one number or one per joint.
+        form: "tendon" for elastic joints, "rigid" for an inelastic robot.
+        sensors: Sensors in addition to the standard set, see `elastic_env.world.further_sensors`.
+        reward: Weights of the reward terms, or a mapping of changes to the default.
+        timestep_s: Physics step, which divides the control period of 4 ms [s]. The default is 0.5
+            ms, or the largest stable step if the joints are unstable with it.
         action_bound_rad: Largest command offset [rad].
 
     Raises:
@@ -106,9 +104,9 @@ def configure_robot(
         problem = "needs a model beside joints, such as model='arm.xml'"
         raise ConfigurationError(f"{ID} {problem}")
     robot = joint_robot(model, {} if joints is None else joints, end_effector)
-    carried_kg = robot.load_kg if load_kg is None else load_kg
-    robot = replace(robot, home=_home(robot, home), imu=imu, load_kg=carried_kg)
-    settings = robot.configure(
+    load_kg = robot.load_kg if load_kg is None else load_kg
+    robot = replace(robot, home=_home_angles(robot, home), imu=imu, load_kg=load_kg)
+    config = robot.configure(
         reference=reference,
         scenario=scenario,
         stiffness=stiffness,
@@ -118,28 +116,28 @@ def configure_robot(
         timestep_s=timestep_s,
         action_bound_rad=action_bound_rad,
     )
-    settings = robot.within_torque(settings, moves_home=home is None)
+    config = robot.with_near_poses(config, moves_home=home is None)
     if timestep_s is None:
-        period_s = settings.control_period_s
-        model = compile_spec(robot.elastic(settings), "the model with elastic joints")
-        timestep_s = stable_timestep(stiffest_plant(model, settings.scenario), period_s)
+        period_s = config.control_period_s
+        model = compile_spec(robot.elastic(config), "the model with elastic joints")
+        timestep_s = stable_timestep(stiffest_plant(model, config.scenario), period_s)
         if timestep_s < (shortest_s := period_s / MOST_SUBSTEPS):
-            name, inertia = own_joints.lightest_links(robot.rigid().compile(), settings.joints)
+            name, inertia = assumptions.lightest_links(robot.rigid().compile(), config.joints)
             raise ConfigurationError(
                 "the joints are too stiff, or their links or rotors too light: in simulation they"
                 f" explode with a physics step of {shortest_s:g} s, the shortest that is played;"
                 " give them less stiffness, or more rotor_inertia. Of the links the fastest are"
                 f" those of joint {name!r}: {inertia:.3g} kg·m² on a spring of"
-                f" {settings.joints[name].stiffness:g} N·m/rad"
+                f" {config.joints[name].stiffness:g} N·m/rad"
             )
-        settings = settings.replace(timestep_s=timestep_s)
-    return settings
+        config = config.replace(timestep_s=timestep_s)
+    return config
 
 
 def joint_robot(
     model: GivenModel, joints: GivenJoints, end_effector: str | None = None
 ) -> JointRobot:
-    """A robot from its model and its elastic joints; arguments and errors as `configure_robot`."""
+    """Make a robot from its model and its elastic joints, see `configure_robot`."""
     spec = read_robot(model)
     whole = compile_spec(spec, "the model")
     require_robot(whole)
@@ -148,7 +146,7 @@ def joint_robot(
     moving = hold_other_joints(spec, settings)
     rigid = compile_spec(moving.copy(), "the model with held joints")
     mass = float(rigid.body_subtreemass[0])
-    elastic = own_joints.elastic_joints(moving, settings, LOAD_SHARE * mass)
+    elastic = assumptions.elastic_joints(moving, settings, LOAD_SHARE * mass)
     if len({joint.encoder_counts_per_turn for joint in elastic.values()}) > 1:
         needed = "encoder_counts_per_turn must be the same for all joints"
         raise ConfigurationError(f"{needed}; give it under '*'")
@@ -156,37 +154,37 @@ def joint_robot(
         NAME,
         RigidModel(model, tuple(names)),
         elastic,
-        home=own_joints.home_of_joints(whole, names).tolist(),
+        home=assumptions.home_of_joints(whole, names).tolist(),
         end_effector=end_effector or outermost_body(rigid),
         load_kg=mass,
     )
 
 
 def _elastic_hinges(model: MjModel, joints: GivenJoints) -> dict[str, JointSettings]:
-    """Settings of the elastic hinges: of those that a pattern fits all but coupled fingers."""
+    """Settings of the elastic hinges; a pattern does not match coupled fingers."""
     hinges = model_joints.hinges_of(model)
-    given = joint_mapping(joints)
+    mapping = joint_mapping(joints)
     names = [model.joint(j).name for j in range(model.njnt)]
     others = [name for name in names if name not in hinges]
-    settings = own_joints.elastic_settings(given, hinges, others)
-    nameless = key_of(given, "")
-    is_meant = nameless is not None and given[nameless] != HELD
+    settings = assumptions.elastic_settings(mapping, hinges, others)
+    nameless = key_of(mapping, "")
+    is_meant = nameless is not None and mapping[nameless] != HELD
     if is_meant and model_joints.has_nameless_hinge(model):
         raise model_joints.nameless_hinge()
-    moving = without_fingers(model, settings, given)
+    moving = without_fingers(model, settings, mapping)
     return {name: settings[name] for name in moving}
 
 
-def _home(
-    robot: JointRobot, given: Mapping[str, float] | Sequence[float] | None
+def _home_angles(
+    robot: JointRobot, home: Mapping[str, float] | Sequence[float] | None
 ) -> Sequence[float] | None:
-    """Angles by name, of which those that are not given are the robot's own."""
-    if not isinstance(given, Mapping):
-        return robot.home if given is None else given
-    require_known("joint of home", given, robot.joints)
-    own: Sequence[float] = robot.home or [0.0] * len(robot.joints)
-    pairs = zip(robot.joints, own, strict=True)
-    return [given.get(name, angle) for name, angle in pairs]
+    """Home in order; joints that a mapping leaves out keep the robot's home."""
+    if not isinstance(home, Mapping):
+        return robot.home if home is None else home
+    require_known("joint of home", home, robot.joints)
+    angles: Sequence[float] = robot.home or [0.0] * len(robot.joints)
+    pairs = zip(robot.joints, angles, strict=True)
+    return [home.get(name, angle) for name, angle in pairs]
 
 
 ROBOT = Robot(NAME, ID, configure_robot, JointTask, JointPicture)

@@ -1,4 +1,4 @@
-"""The rigid model of a robot from a file of MJCF or URDF, with bodies that can be drawn."""
+"""Rigid model of a robot from a file of MJCF or URDF, with shapes for pictures."""
 
 import warnings
 from collections.abc import Iterator
@@ -15,42 +15,42 @@ from elastic_env.rendering.simple_bodies import add_simple_bodies
 
 
 def read_robot(model: GivenModel) -> mujoco.MjSpec:
-    """The specification of a robot, which compiles, see `read_model`.
+    """Read the specification of a robot, see `read_model`.
 
-    Collision shapes of a URDF are left out. What has a mesh that is missing, or that MuJoCo cannot
-    read, is drawn by rods between the joints. Bodies without a name get numbers where no body that
-    a hinge moves has a name, since the end effector is one by name.
+    Collision shapes of a URDF are left out. Rods between the joints replace meshes that are missing
+    or that MuJoCo cannot read. The end effector needs a named body. So bodies without a name get
+    numbers if no body that a hinge moves has a name.
 
     Args:
         model: File, text or specification; it is not changed.
 
     Raises:
-        ConfigurationError: It cannot be read or compiled, or a body has its mass from a mesh that
-            is missing.
+        ConfigurationError: It cannot be read or compiled, or the mass of a body comes from a
+            missing mesh.
 
     Warns:
-        UserWarning: Meshes are replaced.
+        UserWarning: Rods replace meshes.
     """
-    read = read_model(model, shapes=True)
-    if read.lost:
+    content = read_model(model, shapes=True)
+    if content.lost:
         warnings.warn(
-            f"{len(read.lost)} meshes of {read.name} are missing or in a format that MuJoCo cannot"
-            f" read, such as {quote(read.lost[0])[1:-1]}; rods between the joints are drawn in"
-            " their place",
+            f"{len(content.lost)} meshes of {content.name} are missing or in a format that MuJoCo"
+            f" cannot read, such as {quote(content.lost[0])[1:-1]}; rods between the joints are"
+            " drawn in their place",
             stacklevel=4,
         )
-        add_simple_bodies(read.spec)
-    bodies = read.spec.bodies[1:]
-    if not any(body.name for body in _moved(read.spec)):
-        taken = {body.name for body in bodies}
+        add_simple_bodies(content.spec)
+    bodies = content.spec.bodies[1:]
+    if not any(body.name for body in _moving_bodies(content.spec)):
+        names = {body.name for body in bodies}
         for number, body in enumerate(bodies, 1):
-            if not body.name and (name := f"body_{number}") not in taken:
+            if not body.name and (name := f"body_{number}") not in names:
                 body.name = name
-    return read.spec
+    return content.spec
 
 
-def _moved(spec: mujoco.MjSpec) -> Iterator[Any]:
-    """Bodies that a hinge moves; some of them several times."""
+def _moving_bodies(spec: mujoco.MjSpec) -> Iterator[Any]:
+    """Bodies that a hinge moves; some occur several times."""
     for joint in spec.joints:
         if joint.type == mujoco.mjtJoint.mjJNT_HINGE:
             yield joint.parent
@@ -58,14 +58,13 @@ def _moved(spec: mujoco.MjSpec) -> Iterator[Any]:
 
 
 class RigidModel:
-    """Makes the specification of a robot in which only some hinges move, as `JointRobot` takes it.
+    """Factory of a specification in which only some hinges move, for `JointRobot`.
 
-    It holds what it was given, so that it can be pickled. Contacts are off. Taken out are
-    actuators, and what elastic joints have in their place: armature, dry friction and linear
-    damping of the hinges.
+    It stores its arguments, so that it can be pickled. Contacts are off. Actuators, and armature,
+    dry friction and linear damping of the hinges are removed: elastic joints replace them.
 
     Args:
-        model: As of `read_robot`.
+        model: File, text or specification, see `read_robot`.
         joints: Hinges that move.
     """
 
@@ -75,27 +74,27 @@ class RigidModel:
         self._spec: Any = None
 
     def __call__(self) -> mujoco.MjSpec:
-        """A copy that the caller may change."""
+        """Return a copy that the caller may change."""
         if self._spec is None:
-            # they were said when it was read for the first time
+            # the first reading of the model has already shown the warnings
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", UserWarning)
-                moving = hold_other_joints(read_robot(self._model), self._joints)
-                self._spec = _bare(moving, self._joints)
+                self._spec = hold_other_joints(read_robot(self._model), self._joints)
+                _remove_joint_dynamics(self._spec, self._joints)
         return self._spec.copy()
 
     def __getstate__(self) -> dict[str, Any]:
-        """Files by name, specifications as text."""
-        given: Any = self._model
-        if isinstance(given, mujoco.MjSpec):
-            given = given.copy()
-            compile_spec(given, "the specification")
-            given = given.to_xml()
-        return {"_model": given, "_joints": self._joints, "_spec": None}
+        """Return files by name, specifications as text."""
+        model: Any = self._model
+        if isinstance(model, mujoco.MjSpec):
+            model = model.copy()
+            compile_spec(model, "the specification")
+            model = model.to_xml()
+        return {"_model": model, "_joints": self._joints, "_spec": None}
 
 
-def _bare(spec: mujoco.MjSpec, joints: tuple[str, ...]) -> mujoco.MjSpec:
-    """A model without actuators, contacts, and what an `ElasticJoint` has of its hinges."""
+def _remove_joint_dynamics(spec: mujoco.MjSpec, joints: tuple[str, ...]) -> None:
+    """Remove actuators, contacts, and properties of hinges that an `ElasticJoint` replaces."""
     for actuator in list(spec.actuators):
         spec.delete(actuator)
     for name in joints:
@@ -105,4 +104,3 @@ def _bare(spec: mujoco.MjSpec, joints: tuple[str, ...]) -> mujoco.MjSpec:
         damping[0] = 0.0
         hinge.damping = damping
     spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
-    return spec

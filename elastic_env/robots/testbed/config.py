@@ -1,4 +1,4 @@
-"""Parameters of the testbed task, and the joint that they make."""
+"""Parameters of the testbed task, and the plant that follows from them."""
 
 from functools import partial
 
@@ -18,26 +18,26 @@ from elastic_env.world.robot_model import RobotModel
 
 
 class TestbedConfig(JointConfig):
-    """All of the testbed environment."""
+    """All parameters of the testbed environment."""
 
-    __test__ = False  # not a test class, although its name says so
+    __test__ = False  # pytest takes it for a test class by its name
 
     joint: ElasticJoint = H54_200_S500_R
-    """The joint as it is known; the scenario says in what the true one differs."""
+    """The joint as it is assumed; the scenario defines how the true one differs."""
     pendulum: Pendulum = Pendulum()
 
     @property
     def true_joint(self) -> ElasticJoint:
-        """The joint as the plant has it."""
-        return self.as_built(self.joint)
+        """The joint in the plant."""
+        return self.plant_joint(self.joint)
 
     @property
     def true_pendulum(self) -> Pendulum:
-        """The pendulum as the plant has it."""
+        """The pendulum in the plant."""
         return self.pendulum.with_mass_scaled(self.scenario.pendulum_mass_scale)
 
     def plant(self) -> JointPlant:
-        """The testbed as it is built, and as it is known.
+        """Make the plant, with the true and the assumed testbed.
 
         Raises:
             ConfigurationError: The joint has no servo, or one too weak for the reference.
@@ -57,7 +57,7 @@ class TestbedConfig(JointConfig):
             form=self.form,
             static_torque=pendulum.torque,
             torque_gradient=pendulum.torque_gradient,
-            motion=Motion(partial(reference.about, np.zeros(1)), reference.is_random),
+            motion=Motion(partial(reference.plan_about, np.zeros(1)), reference.is_random),
             imu_arm_m=testbed.imu_arm(pendulum),
         )
 
@@ -84,6 +84,6 @@ class TestbedConfig(JointConfig):
             + (pendulum.inertia + joint.rotor_inertia) * extent.q_ddot
             + joint.viscous_friction * extent.q_dot
         )
-        passed = robot.largest_passed_torque(np.array([needed]))
+        passed = robot.largest_servo_torque(np.array([needed]))
         limits = robot.largest_torque(np.array([extent.q_dot]))
         require_torque(self.reference, passed, limits)

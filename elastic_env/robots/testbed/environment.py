@@ -1,4 +1,4 @@
-"""`elastic_env/Testbed-v0`: make the link follow a reference although the joint bends.
+"""`elastic_env/Testbed-v0`: make the link follow a reference while the joint bends.
 
 Observation of one world (float64):
 
@@ -14,13 +14,13 @@ Observation of one world (float64):
 
 Action of one world (float32): the command offset a = θ_cmd − q_ref [rad], within ±0.3.
 
-`info` of one world, all at the end of the control period, the truth where nothing else is said:
+`info` of one world, at the end of the control period; true values unless the table says otherwise:
 
 | key | unit | meaning |
 |---|---|---|
 | `time_s` | s | since the start of the episode |
 | `reference_angle` | rad | q_ref |
-| `link_angle`, `link_angle_imu` | rad | q, and what its IMU shows |
+| `link_angle`, `link_angle_imu` | rad | q, and q by its IMU |
 | `link_error`, `link_error_imu` | rad | q_ref − q, and by the IMU; positive where the link hangs behind |
 | `deflection` | rad | δ = θ − q |
 | `joint_torque` | N·m | of spring and damper on the link, positive along q |
@@ -67,23 +67,23 @@ def configure_testbed(
     sensors: Sequence[str] = (),
     action_bound_rad: float = ACTION_BOUND_RAD,
 ) -> TestbedConfig:
-    """The testbed's configuration from the arguments of `gymnasium.make`.
+    """Make the testbed's configuration from the arguments of `gymnasium.make`.
 
     Args:
         reference: "hold", "sine", "multisine", "steps", a mapping with `kind` and parameters, or a
             reference model.
         scenario: Name as in `elastic_env.world.scenario`, or a `Scenario`.
-        stiffness: K of the joint [N·m/rad], or the path of an `identification.json`; default that
-            of the joint.
-        joint: Elastic joint, a mapping of what differs from the paper's H54-200-S500-R, the
-            default, or the name of one of `elastic_env.joint.small_servos`.
-        pendulum: The load, or a mapping of what differs from the default of 60 N·m at the
+        stiffness: K of the joint [N·m/rad], or the path of an `identification.json`; by default K
+            of `joint`.
+        joint: Elastic joint, a mapping of changes to the default, which is the paper's
+            H54-200-S500-R, or a name of `elastic_env.joint.small_servos`.
+        pendulum: The load, or a mapping of changes to the default, which has 60 N·m at the
             horizontal.
-        form: "tendon" for the elastic joint, "rigid" for what an inelastic testbed would do.
-        observe_link: Whether the link's IMU is part of the observation.
-        reward: Weights of the reward terms, or a mapping of what differs from the default.
+        form: "tendon" for the elastic joint, "rigid" for an inelastic testbed.
+        observe_link: True to observe the link's IMU.
+        reward: Weights of the reward terms, or a mapping of changes to the default.
         timestep_s: Physics step, which divides the control period of 4 ms; default 0.5 ms [s].
-        sensors: What is observed beside the standard set: "link_encoder", "joint_torque",
+        sensors: Sensors in addition to the standard set: "link_encoder", "joint_torque",
             "accelerometer", see `elastic_env.world.further_sensors`, and "link_imu", which is the
             same as `observe_link`.
         action_bound_rad: Largest command offset [rad].
@@ -95,14 +95,14 @@ def configure_testbed(
         raise ConfigurationError(f"observe_link must be true or false, got {quote(observe_link)}")
     if observe_link and isinstance(sensors, list | tuple):
         sensors = (*sensors, LINK_IMU_SENSOR)
-    given = small_servo(joint) if isinstance(joint, str) else joint
-    chosen = as_model("joint", given, H54_200_S500_R)
+    changes = small_servo(joint) if isinstance(joint, str) else joint
+    elastic_joint = as_model("joint", changes, H54_200_S500_R)
     if stiffness is not None:
-        chosen = chosen.replace(stiffness=read_stiffness(stiffness))
+        elastic_joint = elastic_joint.replace(stiffness=read_stiffness(stiffness))
     return TestbedConfig(
         reference=make_reference(reference),
         scenario=make_scenario(scenario, walks=False),
-        joint=chosen,
+        joint=elastic_joint,
         pendulum=as_model("pendulum", pendulum, Pendulum()),
         form=form,
         sensors=sensors,  # pyright: ignore[reportArgumentType]  the model takes any sequence

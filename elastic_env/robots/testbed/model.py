@@ -1,10 +1,10 @@
 r"""The paper's single-joint testbed (Fig. 4): a servo, a linkage with a pendulum, an IMU.
 
-The pendulum hangs at q = 0 and swings in the vertical plane, q positive towards +x; the torque that
-holds it is τ_g = m g d sin q, 60 N·m at the horizontal. The paper gives neither mass nor length:
-the range of its static deflection (−56 to +42 mrad at 1001 N·m/rad) spans −52.5 to +34.6 N·m, for
-which 60 N·m leave room; a steel bob of 10 kg, 0.61 m from the axis, with a radius of gyration of
-0.1 m, is our choice.
+The pendulum hangs at q = 0 and swings in the vertical plane, q positive towards +x. The torque that
+holds it is τ_g = m g d sin q, 60 N·m at the horizontal. The paper gives neither mass nor length.
+The range of its static deflection (−56 to +42 mrad at 1001 N·m/rad) spans −52.5 to +34.6 N·m, less
+than 60 N·m. We chose a steel bob of 10 kg, 0.61 m from the axis, with a radius of gyration
+of 0.1 m.
 """
 
 import mujoco
@@ -19,7 +19,7 @@ from elastic_env.joint.make_elastic import Form, transform_hinges
 JOINT = "joint"
 GRAVITY_M_S2 = 9.81
 _LEAST = 1e-3
-"""Of the parameters of a pendulum, in their units: with less its inertia is lost in rounding."""
+"""Least value of a pendulum's parameters, in their units: rounding would lose a smaller inertia."""
 
 
 class Pendulum(Model):
@@ -51,18 +51,18 @@ class Pendulum(Model):
         return (self.gravity_torque * np.cos(q))[..., None]
 
     def with_mass_scaled(self, scale: float) -> "Pendulum":
-        """The same pendulum with another mass at the same place."""
+        """Return the pendulum with its mass scaled at the same place."""
         torque = self.gravity_torque * scale
         return self.replace(mass=self.mass * scale, gravity_torque=torque)
 
 
 def imu_arm(pendulum: Pendulum) -> float:
-    """Distance of the IMU from the joint axis, half way to the center of mass [m]."""
+    """Distance of the IMU from the joint axis [m]: half the distance of the center of mass."""
     return 0.5 * pendulum.com_distance
 
 
 def rigid_spec(pendulum: Pendulum, gravity: float = GRAVITY_M_S2) -> MjSpec:
-    """The testbed with a rigid joint and no actuator; every inertia is explicit, no geom collides.
+    """Make the testbed with a rigid joint and no actuator, with explicit inertia and no contacts.
 
     Args:
         pendulum: The load.
@@ -73,13 +73,13 @@ def rigid_spec(pendulum: Pendulum, gravity: float = GRAVITY_M_S2) -> MjSpec:
     spec.compiler.degree = False
     spec.option.gravity = np.array([0.0, 0.0, -gravity])
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_RK4
-    # a NaN must end the episode, not restart the world behind the task's back
+    # a NaN must end the episode; MuJoCo must not restart the world by itself
     spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
     link = spec.worldbody.add_body(name="link", mass=pendulum.mass)
     link.explicitinertial = True
     link.ipos = [0.0, 0.0, -pendulum.com_distance]
     link.inertia = [pendulum.mass * pendulum.gyration_radius**2] * 3
-    # the axis points to −y, so that positive q carries the pendulum towards +x
+    # the axis points to −y, so that positive q moves the pendulum towards +x
     link.add_joint(name=JOINT, type=mujoco.mjtJoint.mjJNT_HINGE, axis=[0.0, -1.0, 0.0])
     link.add_site(name="imu", pos=[0.0, 0.0, -imu_arm(pendulum)])
     return spec
@@ -92,7 +92,7 @@ def elastic_spec(
     timestep_s: float = 5e-4,
     gravity: float = GRAVITY_M_S2,
 ) -> MjSpec:
-    """The testbed with its elastic joint and servo, integrated by RK4."""
+    """Make the testbed with its elastic joint and servo, integrated by RK4."""
     spec = transform_hinges(rigid_spec(pendulum, gravity), {JOINT: joint}, form)
     spec.option.timestep = timestep_s
     return spec

@@ -1,4 +1,4 @@
-"""The testbed's picture: what is drawn at angle x stands at q_ref + factor · (x − q_ref).
+"""Picture of the testbed, with enlarged deviations: x is drawn at q_ref + factor · (x − q_ref).
 
 The translucent pendulum is the reference, the solid one the link, the blue pointer the rotor.
 """
@@ -16,8 +16,8 @@ from elastic_env.robots.deviations import DeviationPicture, enlarge_deviation
 from elastic_env.robots.testbed.model import Pendulum
 
 _SHAPES = Path(__file__).with_suffix(".xml").read_text(encoding="utf-8")
-_OF_LEGEND = {"rotor": "rotor_disc", "link": "link_bob"}
-"""Words of the legend, and the shapes that have their colours."""
+_LEGEND_GEOMS = {"rotor": "rotor_disc", "link": "link_bob"}
+"""Words of the legend, and the shapes with their colours."""
 
 
 class TestbedPicture(DeviationPicture):
@@ -29,13 +29,13 @@ class TestbedPicture(DeviationPicture):
         spec = _display_spec(pendulum)
         _add_light(spec)
         set_stage(spec, deviations.WIDTH, deviations.HEIGHT)
-        colours = {word: spec.geom(name).rgba for word, name in _OF_LEGEND.items()}
+        colours = {word: spec.geom(name).rgba for word, name in _LEGEND_GEOMS.items()}
         colours["reference"] = deviations.REFERENCE_WORD_RGBA
         super().__init__(spec, [*colours.items()])
         self._pendulum = pendulum
 
     def display_robot(self) -> DisplayRobot:
-        """The robot of a side-by-side picture."""
+        """Return the robot of a side-by-side picture."""
         spec = _display_spec(self._pendulum)
         for element in (spec.body("reference"), spec.body("rotor"), *spec.cameras):
             spec.delete(element)
@@ -43,7 +43,7 @@ class TestbedPicture(DeviationPicture):
         return DisplayRobot(spec, ["link"], right, dress=_add_light)
 
     def sides(self, now: Mapping[str, float], world: int = 0) -> Sides:  # noqa: ARG002
-        """Reference, motor side and link side of a world."""
+        """Return reference, motor side and link side of a world."""
         link = now["link_angle"]
         angles = (now["reference_angle"], link + now["deflection"], link)
         return Sides(*(np.array([angle]) for angle in angles))
@@ -58,7 +58,7 @@ class TestbedPicture(DeviationPicture):
 
 
 def _display_spec(pendulum: Pendulum) -> mujoco.MjSpec:
-    """A model for drawing only: three independent hinges, no dynamics."""
+    """Make a model for pictures only: three independent hinges, no dynamics."""
     reach = pendulum.com_distance
     half = 0.36 * reach
     lengths = {"half_rod": reach / 2, "rod": -reach / 2, "bob": -reach}

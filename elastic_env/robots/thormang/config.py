@@ -1,4 +1,4 @@
-"""Parameters of the walking task, and the true robot that a scenario makes of the assumed one."""
+"""Parameters of the walking task, and the true robots of its scenarios."""
 
 import copy
 from functools import lru_cache, partial
@@ -31,20 +31,20 @@ FALL_TILT_RAD = 0.4
 
 
 class WalkRewardWeights(Model):
-    """Weights of the reward terms; every term is a penalty that grows without saturating."""
+    """Weights of the reward terms; every term is a penalty that never saturates."""
 
     tilt: float = quantity("1/rad", 100.0, ge=0, le=1e6)
     """Per rad of pelvis error: 1 at 0.01 rad [1/rad]."""
     zmp: float = quantity("1/m", 1.0 / 0.03, ge=0, le=1e6)
     """Per m of ZMP deviation in the plan's world frame: 1 at 0.03 m [1/m]."""
     zmp_in_feet: float = quantity("1/m", 0.0, ge=0, le=1e6)
-    """Per m of ZMP deviation, were the feet where they are planned [1/m]."""
+    """Per m of ZMP deviation for feet at their planned places [1/m]."""
     foot_drift: float = quantity("1/m", 0.0, ge=0, le=1e6)
-    """Per m of the displacement of the standing feet against the plan [1/m]."""
+    """Per m of displacement of the standing feet from the plan [1/m]."""
     effort: float = quantity("1/(N·m)", 0.001, ge=0, le=1e6)
     """Per N·m of servo torque, rms over the joints [1/(N·m)]."""
     smoothness: float = quantity("s/rad", 0.1, ge=0, le=1e6)
-    """Per rad/s of the offsets, rms over joints [s/rad]."""
+    """Per rad/s of change of the offsets, rms over the joints [s/rad]."""
     fall: float = quantity("1", 200.0, ge=0, le=1e6)
     """Once, at a fall or where the simulation diverges [1]."""
     standing: float = quantity("1", 1.0, ge=0, le=1e6)
@@ -52,31 +52,29 @@ class WalkRewardWeights(Model):
 
 
 class WalkConfig(TaskConfig):
-    """All of the walking environment."""
+    """All parameters of the walking environment."""
 
     gait: Gait = Gait()
     scenarios: tuple[Scenario, ...] = ()
-    """Of every world of a vector environment, where they differ, `scenario` being the first; with
-    the same friction and rate of the IMU.
+    """Scenario of every world of a vector environment, if they differ; the first one is `scenario`.
+    All have the same friction scale and the same rate of the IMU.
     """
     robot: Thormang = Thormang()
     joints: tuple[ElasticJoint, ...] = tuple(Thormang().joints.values())
-    """The leg joints in order, as they are known; the scenario says in what the true ones
-    differ.
-    """
+    """The assumed leg joints in order; the scenario defines how the true ones differ."""
     timestep_s: float = quantity("s", 1e-3, gt=0)
     """Physics step [s]."""
     reward: WalkRewardWeights = WalkRewardWeights()
     bank: int = quantity("1", 0, ge=0)
-    """Bank of robots that a scenario draws from [1]."""
+    """Number of the bank of robots that a scenario draws from [1]."""
     fewest_steps: int | None = quantity("1", None, ge=4)
-    """Fewest steps of a walk in place, whose number is then drawn per episode; None for those of
-    the gait [1]."""
+    """Fewest steps of a walk in place [1]; the number of steps is then drawn per episode. None for
+    the number of the gait."""
     spare_bodies: int = quantity("1", 0, ge=0)
-    """Massless bodies on the torso, which give robots with other loads as many bodies [1]."""
+    """Massless bodies on the torso, so that all robots have the same number of bodies [1]."""
 
     def _check(self) -> None:
-        if any(varies(one) or (one.servo and one.servo.motor) for one in self.joints):
+        if any(varies(joint) or (joint.servo and joint.servo.motor) for joint in self.joints):
             raise ValueError(
                 "joints of the walker must have neither load_friction nor static_friction nor a"
                 " motor, which its plan and policies do not know; the testbed and Robot-v0 do"
@@ -90,57 +88,56 @@ class WalkConfig(TaskConfig):
                 f"fewest_steps must be num_steps = {most} less whole strides of two steps, got"
                 f" {fewest}"
             )
-        frictions = {own.friction_scale: own.name for own in self.scenarios}
-        rates = {own.pelvis_imu.rate_hz: own.name for own in self.scenarios}
-        known = {"friction_scale": frictions, "rate_hz of pelvis_imu": rates}
-        for name, values in known.items():
-            if len(values) > 1:
-                given = " and ".join(f"{one:g} of {own!r}" for one, own in values.items())
-                needed = f"the scenarios of all worlds must have the same {name}"
-                raise ValueError(f"{needed}, got {given}")
+        frictions = {scenario.friction_scale: scenario.name for scenario in self.scenarios}
+        rates = {scenario.pelvis_imu.rate_hz: scenario.name for scenario in self.scenarios}
+        common = {"friction_scale": frictions, "rate_hz of pelvis_imu": rates}
+        for field, names in common.items():
+            if len(names) > 1:
+                got = " and ".join(f"{value:g} of {name!r}" for value, name in names.items())
+                needed = f"the scenarios of all worlds must have the same {field}"
+                raise ValueError(f"{needed}, got {got}")
 
     @property
     def numbers_of_steps(self) -> range:
-        """Numbers of steps that a walk can have."""
+        """Possible numbers of steps of a walk."""
         most = self.gait.num_steps
         return range(self.fewest_steps or most, most + 1, 2)
 
-    def of_each_scenario(self) -> "list[WalkConfig]":
-        """Configurations of the scenarios, in the order in which these first occur."""
+    def scenario_configs(self) -> "list[WalkConfig]":
+        """Configurations of the scenarios, in the order of their first occurrence."""
         if not self.scenarios:
             return [self]
-        each = dict.fromkeys(self.scenarios)
-        alone = [self.replace(scenario=scenario, scenarios=()) for scenario in each]
-        most = max(config.loads for config in alone)
-        return [config.replace(spare_bodies=most - config.loads) for config in alone]
+        scenarios = dict.fromkeys(self.scenarios)
+        configs = [self.replace(scenario=scenario, scenarios=()) for scenario in scenarios]
+        most = max(config.num_loads for config in configs)
+        return [config.replace(spare_bodies=most - config.num_loads) for config in configs]
 
     @property
-    def loads(self) -> int:
-        """Bodies that loads on the torso are."""
+    def num_loads(self) -> int:
+        """Number of bodies for loads on the torso."""
         return (self.true_robot.torso_load_kg > 0.0) + self.scenario.places_loads
 
     @property
     def assumed_joints(self) -> dict[str, ElasticJoint]:
-        """The joints as a policy may know them, with the ground's friction."""
+        """The joints as a policy may know them, with the friction of the scenario's ground."""
         each = zip(LEG_JOINTS, self.joints, strict=True)
-        return {name: self.with_friction_of_ground(joint) for name, joint in each}
+        return {name: self.with_ground_friction(joint) for name, joint in each}
 
     @property
     def true_joints(self) -> dict[str, ElasticJoint]:
-        """The joints as the plant has them, what is drawn aside."""
+        """The joints in the plant, without drawn parameters."""
         each = zip(LEG_JOINTS, self.joints, strict=True)
-        return {name: self.as_built(joint) for name, joint in each}
+        return {name: self.plant_joint(joint) for name, joint in each}
 
     @property
     def true_robot(self) -> Thormang:
-        """The robot as the plant has it, what is drawn aside."""
+        """The robot in the plant, without drawn parameters."""
         load_kg = self.robot.torso_load_kg + self.scenario.shoulder_load_kg
         return self.robot.replace(torso_load_kg=load_kg)
 
     def true_model(self) -> MjModel:
-        """The plant, what is drawn aside; where loads are drawn, with a load of no mass."""
-        own = (self.true_joints, self.form, self.timestep_s)
-        spec = thormang.elastic_spec(self.true_robot, *own)
+        """Compile the plant without drawn parameters; a load to be drawn has no mass."""
+        spec = thormang.elastic_spec(self.true_robot, self.true_joints, self.form, self.timestep_s)
         if self.scenario.places_loads:
             thormang.add_load(spec, DRAWN_LOAD, 0.0, np.zeros(3))
         for number in range(self.spare_bodies):
@@ -152,23 +149,23 @@ class WalkConfig(TaskConfig):
 
 BANK_SIZE = 256
 """Robots in the bank of a scenario whose robots differ."""
-_SETTLED = 2048
-"""Robots that are kept with their state at rest, of 50 kB each."""
+_SETTLED_ROBOTS = 2048
+"""Cached robots with their state at rest, 50 kB each."""
 
 
 @lru_cache(maxsize=64)
 def require_stable_walker(config: WalkConfig) -> None:
-    """Refuse joints that explode with the physics step; looked at once."""
+    """Refuse joints that are unstable with the physics step; a configuration is checked once."""
     model = stiffest_plant(undrawn_model(config), config.scenario)  # pyright: ignore[reportArgumentType]  frozen models can be hashed
     require_stable(model, config.control_period_s)
 
 
-@lru_cache(maxsize=_SETTLED)
+@lru_cache(maxsize=_SETTLED_ROBOTS)
 def placed_robot(config: WalkConfig, robot: DrawnRobot) -> tuple[MjModel, Equilibrium]:
-    """The plant of a robot of the bank, and where it rests under zero offset; found once.
+    """Plant of a robot of the bank, and its equilibrium under zero offset; computed once.
 
     Raises:
-        ElasticError: It does not stand.
+        ElasticError: The robot does not stand.
     """
     plan = plan_walk(config.gait, thormang.biped(config.robot), config.control_period_s)  # pyright: ignore[reportArgumentType]
     model = drawn_model(config, robot)
@@ -183,7 +180,7 @@ def placed_robot(config: WalkConfig, robot: DrawnRobot) -> tuple[MjModel, Equili
 
 
 def drawn_model(config: WalkConfig, robot: DrawnRobot) -> MjModel:
-    """The plant of a robot of the bank."""
+    """Plant of a robot of the bank."""
     undrawn = undrawn_model(config)  # pyright: ignore[reportArgumentType]  frozen models can be hashed
     springs = spring_ids(undrawn, LEG_JOINTS, config.form)
     links = JointAddresses.of(undrawn, LEG_JOINTS).q_dot
@@ -200,7 +197,7 @@ def drawn_model(config: WalkConfig, robot: DrawnRobot) -> MjModel:
 
 @lru_cache(maxsize=64)
 def undrawn_model(config: WalkConfig) -> MjModel:
-    """The plant, what is drawn aside, compiled once."""
+    """Plant without drawn parameters, compiled once."""
     return config.true_model()
 
 
@@ -212,9 +209,9 @@ def floor_tilt(angle: float, direction: float) -> Array:
 
 
 def robot_bank(scenario: Scenario, number: int = 0) -> list[DrawnRobot]:
-    """The robots of a scenario: one, or a bank, the same in every process.
+    """Draw the robots of a scenario: one, or a bank, the same in every process.
 
-    Banks of other numbers have other robots.
+    Banks with different numbers have different robots.
     """
     size = 1 if scenario.has_one_robot else BANK_SIZE
     return draw_robots(scenario.parts, size, len(LEG_JOINTS), (_BANK_SEED, number))

@@ -1,4 +1,4 @@
-"""`elastic_env/WalkInPlace-v0`: the arguments of `gymnasium.make`, and what they make."""
+"""`elastic_env/WalkInPlace-v0`: its configuration from the arguments of `gymnasium.make`."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -16,8 +16,8 @@ from elastic_env.robots.thormang.task import WalkTask
 from elastic_env.world.robot_model import read_stiffness, with_stiffness
 from elastic_env.world.scenario import Scenario, make_scenario
 
-_GAIT = list(Gait.model_fields)[4:]
-"""Parameters behind the durations and the number of steps."""
+_GAIT_FIELDS = list(Gait.model_fields)[4:]
+"""Parameters of a gait after the durations and the number of steps."""
 
 
 def configure_walk(
@@ -35,7 +35,7 @@ def configure_walk(
     sensors: Sequence[str] = (),
     fewest_steps: int | None = None,
 ) -> WalkConfig:
-    """The walker's configuration from the arguments of `gymnasium.make`.
+    """Make the walker's configuration from the arguments of `gymnasium.make`.
 
     Args:
         step_period: 24, 3, 1.6 or 1.1 [s], the three durations of double, single and double support
@@ -44,40 +44,38 @@ def configure_walk(
         scenario: Name as in `elastic_env.world.scenario`, or a `Scenario`; or in a vector
             environment a list with one of them for each world.
         stiffness: K of the joints [N·m/rad], one number or twelve, or the path of an
-            `identification.json`; default that of the joints.
-        joint: Elastic joint for all twelve, or a mapping of what differs from the paper's
-            H54-200-S500-R, the default.
+            `identification.json`; by default K of the joints.
+        joint: Elastic joint for all twelve, or a mapping of changes to the default, which is the
+            paper's H54-200-S500-R.
         robot: The robot's options, or a mapping of them: hip_half_spacing, twin_knee, friction.
-        gait: What differs from walking in place: step_length_m, step_width_m, turn_rad (per step),
-            lift_m, hip_height_m, transfer, settling_steps.
-        form: "tendon" for elastic joints, "rigid" for what an inelastic robot would do.
-        reward: Weights of the reward terms, or a mapping of what differs from the default.
-        bank: Number of the bank that random robots come from, to keep those that are learned from
-            apart.
+        gait: Changes to walking in place: step_length_m, step_width_m, turn_rad (per step), lift_m,
+            hip_height_m, transfer, settling_steps.
+        form: "tendon" for elastic joints, "rigid" for an inelastic robot.
+        reward: Weights of the reward terms, or a mapping of changes to the default.
+        bank: Number of the bank of random robots, which keeps training and test robots apart.
         timestep_s: Physics step, which divides the control period of 4 ms; default 1 ms [s].
-        sensors: What is observed beside the standard set: "link_encoder", "joint_torque",
+        sensors: Sensors in addition to the standard set: "link_encoder", "joint_torque",
             "accelerometer"; see `elastic_env.world.further_sensors`.
-        fewest_steps: Walks in place have from so many steps, at least 4, up to `num_steps`, in
-            whole strides of two, drawn per episode: to learn from. A shorter walk leaves out
-            strides after its second step, and the clock runs over them. Default `num_steps`.
+        fewest_steps: Fewest steps of a walk in place, at least 4, for training. The number of steps
+            is then drawn per episode, up to `num_steps`, in whole strides of two. A shorter walk
+            leaves out strides after its second step, and the clock skips them. Default `num_steps`.
 
     Raises:
         ConfigurationError: A name, a parameter or a combination that does not exist.
     """
     if not isinstance(gait, dict | None):
         raise ConfigurationError(
-            f"gait must be a mapping of {', '.join(_GAIT)}, got {quote(gait)}; see also step_period"
+            f"gait must be a mapping of {', '.join(_GAIT_FIELDS)}, got {quote(gait)}; see also"
+            " step_period"
         )
-    what = "parameter of gait beside step_period and num_steps"
-    require_known(what, gait or {}, _GAIT)
-    chosen = as_model("robot", robot, Thormang())
-    of_robot = chosen.joints
-    joints = {name: as_model("joint", joint, own) for name, own in of_robot.items()}
+    require_known("parameter of gait beside step_period and num_steps", gait or {}, _GAIT_FIELDS)
+    thormang = as_model("robot", robot, Thormang())
+    joints = {name: as_model("joint", joint, default) for name, default in thormang.joints.items()}
     if stiffness is not None:
         joints = with_stiffness(joints, read_stiffness(stiffness))
     steps = {} if num_steps is None else {"num_steps": num_steps}
     is_list = isinstance(scenario, list | tuple)
-    scenarios = [make_scenario(own) for own in (scenario if is_list else [scenario])]
+    scenarios = [make_scenario(name) for name in (scenario if is_list else [scenario])]
     if not scenarios:
         raise ConfigurationError(
             "scenario must be a name, or a list with one for each world, got an empty list"
@@ -86,7 +84,7 @@ def configure_walk(
         gait=make_gait(step_period, **steps, **(gait or {})),
         scenario=scenarios[0],
         scenarios=tuple(scenarios) if is_list else (),
-        robot=chosen,
+        robot=thormang,
         joints=tuple(joints.values()),
         form=form,
         sensors=sensors,  # pyright: ignore[reportArgumentType]  the model takes any sequence

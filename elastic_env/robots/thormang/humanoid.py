@@ -1,4 +1,4 @@
-"""The walker as it is drawn: shapes on its links, solid, and translucent for the plan."""
+"""Shapes of the walker for pictures: a solid robot, and a translucent one for the plan."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -17,7 +17,7 @@ PLAN = "plan_"
 """Prefix of the names of the translucent robot."""
 ZMP = "zmp"
 ZMP_REFERENCE = "zmp_reference"
-"""Names of the markers on the floor, which are moved by `mocap_pos`."""
+"""Names of the markers on the floor; `mocap_pos` moves them."""
 
 LEFT_RGBA = (0.93, 0.56, 0.20, 1.0)
 RIGHT_RGBA = (0.74, 0.37, 0.15, 1.0)
@@ -34,44 +34,42 @@ _COLOURS = {
     "left": LEFT_RGBA,
     "right": RIGHT_RGBA,
 }
-_BESIDE_HIP_M = 0.03
-"""By how much the half pelvis is wider than the half distance of the hips [m]."""
+_PELVIS_MARGIN_M = 0.03
+"""Half width of the pelvis minus half distance of the hips [m]."""
 _FLOOR_RGB = (1.0, 1.0, 1.0)
 _GRID_RGB = (0.85, 0.87, 0.90)
 _SIZE = 720
 _EYE = np.array([3.3, 1.6, 2.05])
 _TARGET = np.array([0.0, 0.0, 0.69])
 _PLAN_INSET_M = 0.008
-"""By how much the plan's shapes are smaller, at most to half: the robot hides its plan where it
-follows it.
-"""
+"""Reduction of the plan's half lengths, at most to half [m]: a robot on its plan hides the plan."""
 
 
 def display_spec(robot: Thormang) -> MjSpec:
-    """A model for drawing only: robot, plan with the prefix `PLAN`, floor, markers."""
-    spec = _dress(robot, is_plan=False)
+    """Make a model for pictures only: robot, plan with the prefix `PLAN`, floor, markers."""
+    spec = _shaped_robot(robot, is_plan=False)
     set_stage(spec, _SIZE, _SIZE)
     spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
-    plan = _dress(robot, is_plan=True)
+    plan = _shaped_robot(robot, is_plan=True)
     spec.attach(plan, prefix=PLAN, frame=spec.worldbody.add_frame())
     _add_floor(spec)
     _add_marker(spec, ZMP_REFERENCE, radius=0.05, height=0.022, rgba=ZMP_REFERENCE_RGBA)
     _add_marker(spec, ZMP, radius=0.03, height=0.0245, rgba=ZMP_RGBA)
     _add_light(spec)
-    axes = _facing(_TARGET - _EYE)
+    axes = _camera_axes(_TARGET - _EYE)
     spec.worldbody.add_camera(name=CAMERA, pos=_EYE, xyaxes=axes, fovy=25.5)
     return spec
 
 
 def solid_spec(robot: Thormang) -> MjSpec:
-    """The robot alone, without floor and light."""
-    spec = _dress(robot, is_plan=False)
+    """Make the robot alone, without floor and light."""
+    spec = _shaped_robot(robot, is_plan=False)
     spec.delete(spec.body("floor"))
     return spec
 
 
 def set_floor_and_light(spec: MjSpec) -> None:
-    """Add to a scene what lies under the robot and above it."""
+    """Add floor and light to a scene."""
     spec.worldbody.add_body(name="floor").add_geom(
         name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 0.05]
     )
@@ -79,8 +77,8 @@ def set_floor_and_light(spec: MjSpec) -> None:
     _add_light(spec)
 
 
-def _dress(robot: Thormang, is_plan: bool) -> MjSpec:
-    """The robot's links with the shapes of `shapes.csv`; the solid one brings the floor."""
+def _shaped_robot(robot: Thormang, is_plan: bool) -> MjSpec:
+    """Make the robot with the shapes of `shapes.csv`; only the solid one has the floor."""
     spec = rigid_spec(robot)
     for site in list(spec.sites):
         spec.delete(site)
@@ -89,25 +87,25 @@ def _dress(robot: Thormang, is_plan: bool) -> MjSpec:
     for row in read_rows(Path(__file__).with_name("shapes.csv")):
         size = [float(number) for number in row["size_m"].split()]
         if row["link"] == "pelvis" and row["kind"] == "block":
-            size[1] = robot.hip_half_spacing + _BESIDE_HIP_M
-        geom = _add_shape(spec, row, _inset(size, is_plan))
+            size[1] = robot.hip_half_spacing + _PELVIS_MARGIN_M
+        geom = _add_shape(spec, row, _shape_size(size, is_plan))
         geom.rgba = PLAN_RGBA if is_plan else _COLOURS[row["colour"]]
     for side, rgba in zip(SIDES, (LEFT_RGBA, RIGHT_RGBA), strict=True):
         sole = spec.geom(f"{side}_sole")
         sole.rgba = PLAN_RGBA if is_plan else rgba
-        sole.size = _inset(sole.size, is_plan)
+        sole.size = _shape_size(sole.size, is_plan)
     return spec
 
 
-def _inset(lengths: Any, is_plan: bool) -> list[float]:
-    """Half lengths of a shape, smaller in the plan."""
+def _shape_size(lengths: Any, is_plan: bool) -> list[float]:
+    """Half lengths of a shape, reduced for the plan."""
     if not is_plan:
         return list(lengths)
     return [max(length - _PLAN_INSET_M, length / 2) for length in lengths]
 
 
 def _add_shape(spec: MjSpec, row: Mapping[str, str], size: list[float]) -> MjsGeom:
-    """A sphere, cylinder, capsule, box, or block, whose edges are the rounder, 0 to 1."""
+    """Add a sphere, cylinder, capsule, box, or block with round edges (roundness 0 to 1)."""
     kind = row["kind"]
     place: dict[str, Any] = {"pos": [float(x) for x in row["place_m"].split()]}
     if kind == "block":
@@ -127,14 +125,14 @@ def _add_shape(spec: MjSpec, row: Mapping[str, str], size: list[float]) -> MjsGe
 
 
 def _add_floor(spec: MjSpec) -> None:
-    """A light floor with a grid."""
+    """Give the floor a light colour and a grid."""
     texture = spec.add_texture(name="grid", width=128, height=128)
     texture.type = mujoco.mjtTexture.mjTEXTURE_2D
     texture.builtin = mujoco.mjtBuiltin.mjBUILTIN_FLAT
     texture.mark = mujoco.mjtMark.mjMARK_EDGE
     texture.rgb1 = texture.rgb2 = _FLOOR_RGB
     texture.markrgb = _GRID_RGB
-    repeat = 2.0 / GRID_M  # MuJoCo lays this many textures on two meters
+    repeat = 2.0 / GRID_M  # MuJoCo repeats the texture so often in two meters
     floor = spec.add_material(name="floor", texrepeat=[repeat] * 2, texuniform=True)
     floor.specular = floor.shininess = 0.0
     floor.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "grid"
@@ -142,7 +140,7 @@ def _add_floor(spec: MjSpec) -> None:
 
 
 def _add_marker(spec: MjSpec, name: str, radius: float, height: float, rgba: Rgba) -> None:
-    """A disc on the floor, higher than the soles, so that one sees it under a foot."""
+    """Add a disc on the floor, higher than the soles, so that it is visible under a foot."""
     spec.add_material(name=name, rgba=rgba, emission=0.25, specular=0.0)
     body = spec.worldbody.add_body(name=name, mocap=True)
     disc = body.add_geom(name=name, material=name)
@@ -152,7 +150,7 @@ def _add_marker(spec: MjSpec, name: str, radius: float, height: float, rgba: Rgb
 
 
 def _add_light(spec: MjSpec) -> None:
-    """Light from above with a shadow, which shows where the feet leave the floor."""
+    """Add light from above; its shadow shows where the feet leave the floor."""
     spec.stat.extent = 1.6
     spec.stat.center = _TARGET
     spec.visual.map.shadowclip = 1.0
@@ -164,8 +162,8 @@ def _add_light(spec: MjSpec) -> None:
     light.specular = [0.15] * 3
 
 
-def _facing(direction: Array) -> list[float]:
-    """The x and y axis of a camera that looks along a direction and stands upright."""
+def _camera_axes(direction: Array) -> list[float]:
+    """Axes x and y of an upright camera that looks along a direction."""
     right = np.cross(direction, [0.0, 0.0, 1.0])
     up = np.cross(right, direction)
     return [*right / np.linalg.norm(right), *up / np.linalg.norm(up)]

@@ -1,11 +1,11 @@
 """The humanoid of the paper: THORMANG, 57 kg, twelve leg joints, built from `legs.csv`.
 
-That table has links, parents before children, in the link frame and SI units. The column `joint` is
-"fixed", "floating" or the name of a hinge.
+The table contains the links, parents before children, in the link frame and SI units. The column
+`joint` is "fixed", "floating" or the name of a hinge.
 
-All link frames are parallel to the pelvis at zero angles; the pelvis frame is the midpoint between
-the hip axes. x forward, y left, z up; joint axes +z (yaw), +x (roll), +y (pitch) on both legs.
-Sources (public GitHub repositories):
+All link frames are parallel to the pelvis at zero angles; the origin of the pelvis is the midpoint
+between the hip axes. x points forward, y left, z up. The joint axes are +z (yaw), +x (roll) and +y
+(pitch) on both legs. Sources (public GitHub repositories):
 
 * lengths, masses and COMs of pelvis and legs, hip spacing 0.210 m, sole 0.26 × 0.16 m, ankle 0.100
   m above the sole: THORMANG "mk2", UPenn-RoboCup/UPennDev2, Robots/THOROP1/THOROPKinematics.h;
@@ -42,17 +42,17 @@ LEG = LegGeometry(thigh=0.3, shank=0.3)
 ANKLE_HEIGHT_M = 0.1
 """Height of the ankle axes over the sole [m]."""
 SOLE_HALF_SIZE_M = (0.13, 0.08)
-"""Half length and half width of the sole, whose middle lies under the ankle [m]."""
+"""Half length and half width of the sole; its center is under the ankle [m]."""
 
 _SOLE_HALF_THICKNESS = 0.01
 _LOAD_GYRATION_M = 0.1
 _TORSO = "upper_body"
-_DOUBLED = ("stiffness", "rotor_inertia", "damping", "coulomb_friction")
-"""Parameters of a knee that are those of one servo twice."""
+_DOUBLED_FIELDS = ("stiffness", "rotor_inertia", "damping", "coulomb_friction")
+"""Parameters of a joint that two servos double."""
 
 
 class Thormang(Model):
-    """The robot and its published uncertainties."""
+    """Options of the robot: published uncertainties, friction of the soles, and load."""
 
     hip_half_spacing: float = quantity("m", 0.105, gt=0)
     """Half the distance of the hips; 0.072 in mk1 [m]."""
@@ -67,15 +67,15 @@ class Thormang(Model):
 
     @property
     def joints(self) -> dict[str, ElasticJoint]:
-        """The elastic leg joints: the paper's servo on all of them."""
-        servo = H54_200_S500_R
-        knee = _twin(servo) if self.twin_knee else servo
-        return {name: knee if "knee" in name else servo for name in LEG_JOINTS}
+        """The elastic leg joints, all with the paper's servo."""
+        joint = H54_200_S500_R
+        knee = _twin_joint(joint) if self.twin_knee else joint
+        return {name: knee if "knee" in name else joint for name in LEG_JOINTS}
 
 
 @lru_cache(maxsize=8)
 def biped(robot: Thormang) -> Biped:
-    """The robot as gait and controller see it."""
+    """Make the robot model for gait and controller."""
     half = robot.hip_half_spacing
     hips = np.array([[0.0, half, 0.0], [0.0, -half, 0.0]])
     rigid = rigid_spec(robot).compile()
@@ -87,18 +87,18 @@ def _numbers(row: dict[str, str], *columns: str) -> Array:
 
 
 def rigid_spec(robot: Thormang, floating: bool = True) -> MjSpec:
-    """The robot with rigid joints and no actuator, all inertias explicit, standing over a floor.
+    """Make the robot with rigid joints, no actuator and explicit inertias, on a floor.
 
     Args:
         robot: Options.
-        floating: Whether the pelvis is free; False fixes it in the air, for checks of the legs.
+        floating: True for a free pelvis; False fixes it in the air, for checks of the legs.
     """
     spec = MjSpec()
     spec.modelname = "thormang"
     spec.compiler.degree = False
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
-    # with 1, soles creep: 0.2 mm/s down a slope of 1 degree
+    # with 1, soles creep by 0.2 mm/s down a slope of 1 degree
     spec.option.impratio = 10.0
     spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
     bodies = {"world": spec.worldbody}
@@ -127,7 +127,7 @@ def rigid_spec(robot: Thormang, floating: bool = True) -> MjSpec:
     for side in SIDES:
         _add_sole(bodies[f"{side}_foot"], side, robot.friction)
     bodies["pelvis"].add_site(name="imu")
-    # a body of its own, so that it can be tilted
+    # a separate body, so that it can be tilted
     floor = spec.worldbody.add_body(name="floor")
     plane = mujoco.mjtGeom.mjGEOM_PLANE
     floor.add_geom(name="floor", type=plane, size=[0.0, 0.0, 0.05])
@@ -140,12 +140,12 @@ def elastic_spec(
     form: Form = "tendon",
     timestep_s: float = 1e-3,
 ) -> MjSpec:
-    """The robot with elastic leg joints, their servos, and force-torque sensors at the ankles.
+    """Make the robot with elastic leg joints, servos, and force-torque sensors at the ankles.
 
     Args:
         robot: Options.
         joints: Parameters of the leg joints by name.
-        form: "tendon", or "rigid" for what an inelastic robot would do.
+        form: "tendon", or "rigid" for an inelastic robot.
         timestep_s: Physics step [s].
     """
     spec = transform_hinges(rigid_spec(robot), joints, form, actuators="replace")
@@ -160,17 +160,17 @@ def elastic_spec(
 
 
 DRAWN_LOAD = "drawn_load"
-"""Body of the load that a scenario draws."""
+"""Name of the body of a load that a scenario draws."""
 
 
 def add_load(spec: MjSpec, name: str, mass: float, place: Array) -> MjsBody:
-    """Fix a load to the upper body; its body.
+    """Fix a load to the upper body, and return the body of the load.
 
     Args:
-        spec: The robot.
-        name: Of the body that the load is.
-        mass: Of the load [kg].
-        place: From the center of mass of the upper body, (3,) [m].
+        spec: Specification of the robot.
+        name: Name of the load's body.
+        mass: Mass of the load [kg].
+        place: Position from the center of mass of the upper body, (3,) [m].
     """
     torso = spec.body(_TORSO)
     load = torso.add_body(name=name, pos=torso.ipos + place, mass=mass)
@@ -181,7 +181,7 @@ def add_load(spec: MjSpec, name: str, mass: float, place: Array) -> MjsBody:
 
 
 def place_load(model: MjModel, mass: float, place: Array) -> None:
-    """Change mass and place of the `DRAWN_LOAD` in a compiled model, as `add_load` has them."""
+    """Change mass and place of the `DRAWN_LOAD` in a compiled model, see `add_load`."""
     load = model.body(DRAWN_LOAD)
     load.mass[:] = mass
     load.inertia[:] = mass * _LOAD_GYRATION_M**2
@@ -190,7 +190,7 @@ def place_load(model: MjModel, mass: float, place: Array) -> None:
 
 
 def _add_sole(foot: MjsBody, side: str, friction: float) -> None:
-    """Box sole and the site of the force-torque sensor at the ankle."""
+    """Add a box sole, and the site of the force-torque sensor at the ankle."""
     sole = foot.add_geom(name=f"{side}_sole", type=mujoco.mjtGeom.mjGEOM_BOX, mass=0.0)
     sole.size = [*SOLE_HALF_SIZE_M, _SOLE_HALF_THICKNESS]
     sole.pos = [0.0, 0.0, _SOLE_HALF_THICKNESS - ANKLE_HEIGHT_M]
@@ -198,16 +198,15 @@ def _add_sole(foot: MjsBody, side: str, friction: float) -> None:
     sole.condim = 4
     sole.contype = 0
     sole.conaffinity = 1
-    sole.priority = 1  # else the larger friction of sole and floor would count
+    sole.priority = 1  # otherwise the larger friction of sole and floor would apply
     foot.add_site(name=f"{side}_ft")
 
 
-def _twin(joint: ElasticJoint) -> ElasticJoint:
-    """The joint of two servos side by side."""
+def _twin_joint(joint: ElasticJoint) -> ElasticJoint:
+    """Return the joint with two parallel servos instead of one."""
     servo = joint.servo
-    doubled: dict[str, Any] = {name: 2.0 * getattr(joint, name) for name in _DOUBLED}
+    doubled: dict[str, Any] = {name: 2.0 * getattr(joint, name) for name in _DOUBLED_FIELDS}
     if servo is not None:
         gains = ("position_gain", "velocity_gain", "integral_gain", "torque_limit")
-        own = {gain: 2.0 * getattr(servo, gain) for gain in gains}
-        doubled["servo"] = servo.replace(**own)
+        doubled["servo"] = servo.replace(**{gain: 2.0 * getattr(servo, gain) for gain in gains})
     return joint.replace(**doubled)

@@ -1,4 +1,4 @@
-"""Static equilibrium of an elastic robot under zero offset: where an episode begins."""
+"""Static equilibrium of an elastic robot under zero offset, the start of an episode."""
 
 import copy
 import platform
@@ -22,10 +22,12 @@ _DAMPING = 75.0
 integration unstable.
 """
 _REST_RATE = 1e-4
-_CHECK_EVERY_S = 0.25
+"""Largest rate of a robot at rest [m/s], [rad/s]."""
+_CHECK_PERIOD_S = 0.25
 _LONGEST_S = 20.0
+"""Time between checks, and largest time until the robot rests [s]."""
 _LONGEST_STEP_S = 1e-3
-"""Longest physics step while the robot settles [s]; the strengthened dampers make it hop else."""
+"""Longest physics step while the robot settles [s]; with a longer one the dampers make it hop."""
 
 
 @dataclass(frozen=True)
@@ -37,29 +39,29 @@ class Equilibrium:
     warmstart: Array
 
 
-_KEPT = DiskCache("standing")
+_CACHE = DiskCache("standing")
 
 
 def equilibrium(
     model: MjModel, joints: Sequence[str], pelvis: Array, q: Array, command: Array
 ) -> Equilibrium:
-    """`settle`, or what an earlier process kept of it, which is the same to the last bit."""
+    """Settle a robot by `settle`, or read the result from the disk cache: the bits are the same."""
     content = np.empty(mujoco.mj_sizeModel(model), dtype=np.uint8)
     mujoco.mj_saveModel(model, None, content)
     start = np.concatenate([pelvis, q, command])
-    key = key_of([*_calculation(), content.tobytes(), repr([*joints]), start.tobytes()])
+    key = key_of([*_platform(), content.tobytes(), repr([*joints]), start.tobytes()])
     sizes = (model.nq, model.na, model.nv)
-    kept = _KEPT.read(key, sum(sizes))
-    if kept is not None:
-        return Equilibrium(*np.split(kept, np.cumsum(sizes)[:-1]))
+    cached = _CACHE.read(key, sum(sizes))
+    if cached is not None:
+        return Equilibrium(*np.split(cached, np.cumsum(sizes)[:-1]))
     rest = settle(model, joints, pelvis, q, command)
-    _KEPT.keep(key, np.concatenate([rest.qpos, rest.act, rest.warmstart]))
+    _CACHE.keep(key, np.concatenate([rest.qpos, rest.act, rest.warmstart]))
     return rest
 
 
 @cache
-def _calculation() -> tuple[bytes | str, ...]:
-    """What the bits of a calculation depend on beside its input: programs, and the processor."""
+def _platform() -> tuple[bytes | str, ...]:
+    """Programs and processor, which the bits of a result depend on in addition to its input."""
     source = Path(__file__).read_bytes()
     cpu = processor.get_host_cpu_name(), processor.get_host_cpu_features().flatten()
     return source, mujoco.__version__, repr(platform.libc_ver()), *cpu
@@ -68,45 +70,45 @@ def _calculation() -> tuple[bytes | str, ...]:
 def settle(
     model: MjModel, joints: Sequence[str], pelvis: Array, q: Array, command: Array
 ) -> Equilibrium:
-    """Let a robot come to rest from a posture.
+    """Simulate a robot from a posture until it rests.
 
-    On the way its dampers are strengthened and its friction is switched off, which shortens the
-    way; where it stands in the end is an equilibrium with friction too.
+    Stronger dampers and no friction shorten this motion. Its end is also an equilibrium with
+    friction.
 
     Args:
         model: The plant; it is not changed.
         joints: Its elastic joints, in order.
-        pelvis: Position of the level pelvis to begin with, (3,) [m].
-        q: Joint angles to begin with, (n,) [rad].
+        pelvis: Initial position of the level pelvis, (3,) [m].
+        q: Initial joint angles, (n,) [rad].
         command: Servo inputs, (n,) [rad].
 
     Raises:
-        ElasticError: It does not come to rest, or falls, or its joints are too stiff for the
+        ElasticError: The robot does not come to rest, or falls, or its joints are too stiff for the
             physics step.
     """
-    calm = copy.copy(model)
-    calm.opt.timestep = min(model.opt.timestep, _LONGEST_STEP_S)
-    calm.tendon_damping[:] = np.maximum(calm.tendon_damping, _DAMPING)
-    calm.dof_frictionloss[:] = 0.0
-    data = mujoco.MjData(calm)
-    at = JointAddresses.of(calm, joints)
+    damped = copy.copy(model)
+    damped.opt.timestep = min(model.opt.timestep, _LONGEST_STEP_S)
+    damped.tendon_damping[:] = np.maximum(damped.tendon_damping, _DAMPING)
+    damped.dof_frictionloss[:] = 0.0
+    data = mujoco.MjData(damped)
+    addresses = JointAddresses.of(damped, joints)
     data.qpos[:3] = pelvis
-    data.qpos[at.q] = data.qpos[at.theta] = q
+    data.qpos[addresses.q] = data.qpos[addresses.theta] = q
     data.ctrl[:] = command
-    was_calm = False
-    substeps = round(_CHECK_EVERY_S / calm.opt.timestep)
-    for _ in range(round(_LONGEST_S / _CHECK_EVERY_S)):
-        mujoco.mj_step(calm, data, substeps)
+    was_slow = False
+    substeps = round(_CHECK_PERIOD_S / damped.opt.timestep)
+    for _ in range(round(_LONGEST_S / _CHECK_PERIOD_S)):
+        mujoco.mj_step(damped, data, substeps)
         rate = float(np.abs(data.qvel).max())
         if not np.isfinite(rate):
-            raise _diverged(model, data)
+            raise _divergence_error(model, data)
         if data.qpos[2] < 0.5 * pelvis[2]:
             break
-        is_calm = was_calm and rate < _REST_RATE
-        was_calm = rate < _REST_RATE
-        if is_calm:  # twice in a row: once may be the turning point of a swing
+        is_slow = rate < _REST_RATE
+        if is_slow and was_slow:  # once may be the turning point of a swing
             state = (data.qpos, data.act, data.qacc_warmstart)
             return Equilibrium(*(values.copy() for values in state))
+        was_slow = is_slow
     raise ElasticError(
         f"the robot does not stand: pelvis at {data.qpos[2]:.3f} m (planned {pelvis[2]:.3f} m) and"
         f" moving with {np.abs(data.qvel).max():.2g} rad/s or m/s after {data.time:.1f} s; is a"
@@ -114,9 +116,9 @@ def settle(
     )
 
 
-def _diverged(model: MjModel, data: mujoco.MjData) -> ElasticError:
-    """The error for a state that is not finite: joints that the physics step cannot resolve."""
-    # the elastic joints' springs are all tendons that there are
+def _divergence_error(model: MjModel, data: mujoco.MjData) -> ElasticError:
+    """Error for a state that is not finite: joints that are too stiff for the physics step."""
+    # all tendons are springs of elastic joints
     stiffest = model.tendon_stiffness.max(initial=0.0)
     return ElasticError(
         f"the simulation of the standing robot diverges within {data.time:.2f} s: with a largest K"

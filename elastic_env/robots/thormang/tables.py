@@ -18,34 +18,33 @@ _SIDEWAYS = ("_yaw", "_roll")
 JOINTS: Mapping[str, Mirrored] = {
     name: "opposite" if name.endswith(_SIDEWAYS) else "same" for name in LEG_JOINTS
 }
-"""The joints in order, and what an angle of theirs is in the mirror."""
+"""The joints in order, and the sign of each angle in the mirror image."""
 
-
-_OF_JOINTS = joint_groups(JOINTS)
+_JOINT_GROUPS = joint_groups(JOINTS)
 
 
 def _group(name: str, rows: list[dict[str, Any]]) -> SignalGroup:
-    if name in _OF_JOINTS:
-        return _OF_JOINTS[name]
+    if name in _JOINT_GROUPS:
+        return _JOINT_GROUPS[name]
     signals = tuple(Signal(**row) for row in rows)
     return SignalGroup(name, signals, _SHAPES.get(name, (len(signals),)))
 
 
 _SHAPES = {"wrench": (2, 2, 3)}
-"""Feet, force and moment, axes."""
-_rows_of = itertools.groupby(
+"""Shapes of groups: feet, force and moment, axes."""
+_rows_by_group = itertools.groupby(
     read_rows(Path(__file__).with_name("signals.csv")),
     key=lambda row: row["name"].split(".")[0],
 )
-GROUPS = tuple(_group(name, list(rows)) for name, rows in _rows_of)
-"""The observation, by `signals.csv`."""
+GROUPS = tuple(_group(name, list(rows)) for name, rows in _rows_by_group)
+"""Groups of the observation, from `signals.csv`."""
 
 MEASURED = ("imu_attitude", "imu_rate", "wrench")
-"""Groups with the noise of `sensor_noise`."""
+"""Groups with noise by `sensor_noise`."""
 
 
 def sensor_noise(scenario: Scenario, is_inertial: bool) -> dict[str, Parameter]:
-    """Standard deviations of the groups in `MEASURED`; in an inertial IMU before its filter."""
+    """Standard deviations of the groups in `MEASURED`; before the filter of an inertial IMU."""
     attitude_rad = scenario.pelvis_imu.noise_rad
     rate_rad_s = scenario.gyro_noise_rad_s
     if is_inertial:
@@ -60,8 +59,8 @@ OBSERVATION = SignalTable.of(GROUPS)
 FELL = "fell"
 
 PHASES = ("double", "single", "transition")
-"""Masks by which the scores are split: double support, single support, ±0.2 s around lift-off
-and touch-down.
+"""Masks of parts of the walk: double support, single support, ±0.2 s around lift-off and
+touch-down.
 """
 
 BLOCKS = ("first_steps", "last_steps")

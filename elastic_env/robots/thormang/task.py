@@ -1,6 +1,6 @@
 """The walking task: walk on elastic legs, in place or from foothold to foothold.
 
-The pelvis is to stay level, and the ZMP and the feet where they are planned. `score` in
+The goal is a level pelvis, and ZMP and feet at their planned places. `score_walk` in
 `world.control_kernels` is the reward, `WalkRewardWeights` has its weights.
 
 Observation of one world (float64); joints are l_hip_yaw, l_hip_roll, l_hip_pitch, l_knee,
@@ -11,8 +11,8 @@ column per joint or component after it:
 |---|---|---|---|
 | 0 to 11 | `encoder_angle.<joint>` | rad | motor encoder, θ in whole counts |
 | 12 to 23 | `encoder_rate.<joint>` | rad/s | its change over the last control period |
-| 24, 25 | `imu_attitude.roll`, `.pitch` | rad | IMU in the pelvis; in the scenario `imu` by its own filter |
-| 26 to 28 | `imu_rate.x`, `.y`, `.z` | rad/s | its gyroscope, in the frame of the pelvis; in `imu` a period's mean |
+| 24, 25 | `imu_attitude.roll`, `.pitch` | rad | IMU in the pelvis; by its own filter in the scenario `imu` |
+| 26 to 28 | `imu_rate.x`, `.y`, `.z` | rad/s | its gyroscope, in the frame of the pelvis; the mean of a period in `imu` |
 | 29 to 31 | `wrench.l_fx`, `.l_fy`, `.l_fz` | N | left ankle sensor: force of foot on leg, in the foot's frame |
 | 32 to 34 | `wrench.l_mx`, `.l_my`, `.l_mz` | N·m | moment about the ankle, likewise |
 | 35 to 40 | `wrench.r_fx` to `.r_mz` | N, N·m | right ankle sensor |
@@ -29,12 +29,12 @@ column per joint or component after it:
 Action of one world (float32): the command offsets a = θ_cmd − q_ref [rad] in the order of the
 joints, within ±0.3.
 
-`info` of one world, all at the end of the control period, the truth where nothing else is said;
-positions are in the plan's world frame, x forward at the start, y to the left:
+`info` of one world, at the end of the control period; true values unless the table says otherwise.
+Positions are in the plan's world frame, x forward at the start, y to the left:
 
 | key | unit | meaning |
 |---|---|---|
-| `time_s` | s | since the start of the plan, of which a walk of fewer steps leaves out strides |
+| `time_s` | s | since the start of the plan; a walk of fewer steps leaves out strides |
 | `pelvis_roll`, `pelvis_pitch` | rad | attitude of the pelvis, positive to the right and forward down |
 | `pelvis_error` | rad | angle between its z axis and the vertical, never negative |
 | `pelvis_height` | m | of the pelvis' origin |
@@ -42,9 +42,9 @@ positions are in the plan's world frame, x forward at the start, y to the left:
 | `zmp_reference_x`, `zmp_reference_y` | m | planned |
 | `zmp_deviation` | m | distance to the plan; nan likewise |
 | `zmp_deviation_x`, `zmp_deviation_y` | m | its parts, measured − planned |
-| `foot_drift` | m | displacement of the feet against the plan, by their shares of the force; nan likewise |
+| `foot_drift` | m | displacement of the feet from the plan, weighted by their shares of the force; nan likewise |
 | `foot_drift_x`, `foot_drift_y` | m | its parts |
-| `zmp_in_feet` | m | distance of the ZMP to the plan, were the feet where they are planned; nan likewise |
+| `zmp_in_feet` | m | distance of the ZMP to the plan for feet at their planned places; nan likewise |
 | `zmp_in_feet_x`, `zmp_in_feet_y` | m | its parts, `zmp_deviation` − `foot_drift` |
 | `link_error` | rad | rms of q_ref − q over the twelve joints |
 | `link_error_lowest`, `link_error_highest` | rad | smallest and largest of them |
@@ -57,101 +57,39 @@ positions are in the plan's world frame, x forward at the start, y to the left:
 | `swing`, `single_support` | 1 | progress of the swing; 1 where one foot carries alone, else 0 |
 | `support` | 1 | support foot of the step, 0 left, 1 right |
 | `position_error` | m | distance of the middle of the ankles from the planned one |
-| `heading_error` | rad | heading of the pelvis less the planned one, positive to the left |
-| `early_touchdown` | s | at a planned touch-down, time since the first touch in the second half of the swing; else 0 |
+| `heading_error` | rad | heading of the pelvis minus the planned one, positive to the left |
+| `early_touchdown` | s | at a planned touch-down, time since the first touch-down in the second half of the swing; else 0 |
 | `clipped` | 1 | 1 where an action was beyond its bounds |
 | `reward_terms` | 1 | weighted terms of the reward, by name |
 | `termination` | | why the episode ended: "fell", "diverged", or "" |
 | `episode_metrics` | | at the end of the episode: its figures, whose names end with their unit; ZMP where loaded |
 """  # noqa: E501
 
-import copy
-from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-import mujoco
 import numpy as np
 
 from elastic_env.core.episode_random import EpisodeRandom
 from elastic_env.core.errors import ConfigurationError
-from elastic_env.core.robot_ranges import DrawnRobot
 from elastic_env.core.signals import Array, BoolArray, IntArray, Signals
 from elastic_env.motion import walk_plan
 from elastic_env.motion.gait import LEFT, RIGHT
-from elastic_env.motion.trajectory import STAND_S, Motion, Plan
+from elastic_env.motion.trajectory import Motion, Plan
 from elastic_env.motion.walk_plan import WalkPlan, plan_walk
-from elastic_env.robots.thormang import NAME, tables
-from elastic_env.robots.thormang import rows as records
-from elastic_env.robots.thormang.config import (
-    FALL_HEIGHT_SHARE,
-    FALL_TILT_RAD,
-    WalkConfig,
-    placed_robot,
-    require_stable_walker,
-    robot_bank,
-    undrawn_model,
-)
-from elastic_env.robots.thormang.model import SIDES, biped
+from elastic_env.robots.thormang import NAME, constants, records, tables
+from elastic_env.robots.thormang.config import WalkConfig, placed_robot
+from elastic_env.robots.thormang.constants import TOUCHDOWN, RobotKind
+from elastic_env.robots.thormang.model import biped
 from elastic_env.world import control_kernels as kernels
-from elastic_env.world.foot_sensors import FootSensors, foot_errors
+from elastic_env.world.foot_sensors import foot_errors
+from elastic_env.world.records import Records, Sample, first_columns
 from elastic_env.world.robot_model import WalkerModel
-from elastic_env.world.rows import Records, Sample, columns_of, one
-from elastic_env.world.sensors import is_due
 from elastic_env.world.task import Task, spring_torque
-
-_STEPS_BEFORE_SKIP = 2
-"""Steps after which one stride of a walk in place is as the next: the preview control has
-forgotten the start, and does not see the end yet."""
-UNLOADED_SHARE = 0.05
-"""Share of the weight below which a foot, or the sensors of both together, count as unloaded."""
-
-
-@dataclass(frozen=True, eq=False)
-class _Kind:
-    """The robots of one scenario.
-
-    Attributes:
-        config: Of their worlds, which have no other scenario.
-        bank: What they are drawn from.
-        model: Their plant, what is drawn aside.
-        true_model: Their true joints and masses.
-    """
-
-    config: WalkConfig
-    bank: Sequence[DrawnRobot]
-    model: mujoco.MjModel
-    true_model: WalkerModel
-
-    @staticmethod
-    def of(config: WalkConfig, plan: WalkPlan) -> "_Kind":
-        """Those of a configuration and a planned motion."""
-        require_stable_walker(config)  # pyright: ignore[reportArgumentType]  frozen models can be hashed
-        bank = robot_bank(config.scenario, config.bank)
-        body = biped(config.true_robot)  # pyright: ignore[reportArgumentType]
-        period_s = config.control_period_s
-        if config.true_robot != config.robot:
-            plan = walk_plan.with_torque(plan, body, period_s)
-        joints = config.true_joints
-        model = WalkerModel(joints, body.rigid, period_s, biped=body, plan=plan)
-        return _Kind(config, bank, copy.copy(undrawn_model(config)), model)  # pyright: ignore[reportArgumentType]
-
-    @property
-    def encoder_counts(self) -> int | None:
-        """Counts per turn of the encoders; None for continuous ones."""
-        has_counts = self.config.scenario.encoder_counts
-        return self.true_model.encoder_counts_per_turn if has_counts else None
-
-    @property
-    def fits(self) -> list[tuple[bool, bool]]:
-        """Pairs (measurements are delayed, IMU is inertial) that robots of the bank have."""
-        pairs = [(robot.is_delayed, robot.is_inertial) for robot in self.bank]
-        return list(dict.fromkeys(pairs))
 
 
 class WalkTask(Task):
-    """Rules of `elastic_env/WalkInPlace-v0`: gait, contacts, pelvis and ZMP beside the joints."""
+    """Rules of `elastic_env/WalkInPlace-v0`: joints, gait, contacts, pelvis and ZMP."""
 
     config: WalkConfig
     assumed_model: WalkerModel
@@ -165,13 +103,12 @@ class WalkTask(Task):
             needed = f"a name, or a list with one for each world, {num_worlds}"
             raise ConfigurationError(f"scenario must be {needed}, got {len(scenarios)}")
         robot = biped(config.robot)  # pyright: ignore[reportArgumentType]  frozen models can be hashed
-        joints = config.assumed_joints
         period_s = config.control_period_s
         plan = plan_walk(config.gait, robot, period_s)  # pyright: ignore[reportArgumentType]
-        assumed = WalkerModel(joints, robot.rigid, period_s, biped=robot, plan=plan)
+        assumed = WalkerModel(config.assumed_joints, robot.rigid, period_s, biped=robot, plan=plan)
         walk_plan.require_feasible(plan, robot, assumed.servos)
-        kinds = [_Kind.of(own, plan) for own in config.of_each_scenario()]
-        self._fits = [(kind, *fit) for kind in kinds for fit in kind.fits]
+        kinds = [RobotKind.of(part, plan) for part in config.scenario_configs()]
+        self._variants = [(kind, *pair) for kind in kinds for pair in kind.sensor_variants]
         super().__init__(
             config=config,
             name=NAME,
@@ -183,35 +120,35 @@ class WalkTask(Task):
             joints=tables.JOINTS,
             scenarios=scenarios,
             metrics=tables.METRICS,
-            kinds=[(kind.encoder_counts, is_late) for kind, is_late, _ in self._fits],
+            kinds=[(kind.encoder_counts, is_delayed) for kind, is_delayed, _ in self._variants],
         )
         table = self.observation_table
         by_scenario = {kind.config.scenario: kind for kind in kinds}
         self.plan = plan
         self._kinds = kinds
-        self._true_models = tuple(kind.true_model.observed_by(table) for kind in kinds)
+        self._true_models = tuple(kind.true_model.with_observation_table(table) for kind in kinds)
         self._kind_of_world = [by_scenario[scenario] for scenario in scenarios]
         self._torso = self.model.body("upper_body").id
-        self._phases = _phase_rows(plan)
+        self._phases = constants.phase_masks(plan)
         self._bias = np.zeros(num_worlds, records.BIAS)
-        of_step = round(plan.gait.step_period_s / period_s)
+        step_rows = round(plan.gait.step_period_s / period_s)
         most = plan.gait.num_steps
-        self._skips = [of_step * (most - number) for number in config.numbers_of_steps]
+        self._skips = [step_rows * (most - number) for number in config.numbers_of_steps]
         self.fewest_control_steps = self.num_steps - max(self._skips)
-        constants = [_constants_of(*fit) for fit in self._fits]
-        self._walk_constants = np.concatenate(constants)
-        self._inertial = _inertial(self._fits, robot.gravity)
-        self._plan_rows = _plan_rows(plan, config)
-        self._walk_columns = columns_of(table, records.COLUMNS)
-        self._pushes = any(drawn.push_n > 0.0 for kind in kinds for drawn in kind.bank)
+        self._walk_constants = np.concatenate(
+            [constants.walk_constants(kind, inertial) for kind, _, inertial in self._variants]
+        )
+        self._inertial = constants.inertial_constants(self._variants, robot.gravity)
+        self._plan_rows = constants.plan_rows(plan, config)
+        self._walk_columns = first_columns(table, records.COLUMNS)
+        self._has_pushes = any(drawn.push_n > 0.0 for kind in kinds for drawn in kind.bank)
         push_s = np.array([scenario.push_s for scenario in scenarios])
         self._push_steps = (push_s / period_s).round()
         self._push_force = np.zeros((num_worlds, 3))
         self._push_begin = np.full(num_worlds, -1, dtype=np.int64)
-        self._phases.flags.writeable = False
 
     def has_fallen(self) -> BoolArray:
-        """Worlds whose pelvis is too low or too much tilted, (num_worlds,)."""
+        """Return a mask of worlds whose pelvis is too low or tilted too much, (num_worlds,)."""
         truth = self._worlds[self._row]["truth"]
         rules = self._walk_constants[self._kind]
         is_low = truth["pelvis"][:, 2] < rules["lowest_pelvis_m"]
@@ -219,15 +156,15 @@ class WalkTask(Task):
         return (is_low | is_tilted) & ~truth["diverged"]
 
     def truth(self) -> records.WalkTruth:
-        """State without noise, and the true parameters."""
+        """Return the state without noise, and the true parameters."""
         joints = self._joints[self._row]["truth"]
         body = self._worlds[self._row]["truth"]
-        of_joints = ("theta", "theta_dot", "q", "q_dot", "stiffness", "backlash")
-        of_body = ("pelvis", "ankles", "pelvis_rate", "wrench")
+        joint_fields = ("theta", "theta_dot", "q", "q_dot", "stiffness", "backlash")
+        body_fields = ("pelvis", "ankles", "pelvis_rate", "wrench")
         return records.WalkTruth(
-            **{name: joints[name].copy() for name in of_joints},
+            **{name: joints[name].copy() for name in joint_fields},
             **{name: self._bias[name].copy() for name in ("load", "slope", "friction")},
-            **{name: body[name].copy() for name in of_body},
+            **{name: body[name].copy() for name in body_fields},
             mounting=self._bias["imu_attitude"].copy(),
             pelvis_R=kernels.rotations_of(body["quaternion"].copy()),
             attitude=np.column_stack([body["roll"], body["pitch"]]),
@@ -238,39 +175,39 @@ class WalkTask(Task):
         generator = random.robot
         kind = self._kind_of_world[world]
         robot = kind.bank[int(generator.integers(len(kind.bank)))]
-        self._take_robot(world, robot)
+        self._set_robot(world, robot)
         bias = self._bias
         kg = robot.load_kg
         bias["load"][world] = kg, kg * robot.load_x_m, kg * robot.load_y_m
-        way = robot.slope_direction_rad
-        rise = np.array([np.cos(way), np.sin(way)])
-        bias["slope"][world] = robot.slope_rad * rise
+        direction = robot.slope_direction_rad
+        unit = np.array([np.cos(direction), np.sin(direction)])
+        bias["slope"][world] = robot.slope_rad * unit
         bias["friction"][world] = robot.friction
         bias["imu_attitude"][world] = robot.mounting_rad
-        # not used: the trial follows what has always been drawn here
+        # unused numbers, which keep the trials of recorded results the same
         generator.random(2)
         self._draw_push(world, random)
         self._noise.restart(world, random.noise())
-        fit = (kind, robot.is_delayed, robot.is_inertial)
-        self._kind[world] = self._fits.index(fit)
+        variant = (kind, robot.is_delayed, robot.is_inertial)
+        self._kind[world] = self._variants.index(variant)
         self._draw_imu(world, generator)
         for name, values in foot_errors(robot).items():
             bias[name][world] = values
         if len(self._skips) > 1:
-            number = random.draw_trial(lambda own: int(own.integers(len(self._skips))))
+            number = random.draw_trial(lambda rng: int(rng.integers(len(self._skips))))
             bias["skipped"][world] = self._skips[number]
 
     def _draw_push(self, world: int, random: EpisodeRandom) -> None:
-        """Time and direction of the push, in the steps that are scored."""
+        """Draw time and direction of the push, within the scored steps."""
         scored = np.flatnonzero(self.plan.timing.scored)
         ends = (scored[0], scored[-1] + 1)
-        self._push_begin[world] = random.draw_trial(lambda own: own.integers(*ends))
-        direction = random.draw_trial(lambda own: own.uniform(0.0, 2.0 * np.pi))
+        self._push_begin[world] = random.draw_trial(lambda rng: rng.integers(*ends))
+        direction = random.draw_trial(lambda rng: rng.uniform(0.0, 2.0 * np.pi))
         unit = np.array([np.cos(direction), np.sin(direction), 0.0])
         self._push_force[world] = self._robots[world].push_n * unit
 
     def _draw_imu(self, world: int, generator: np.random.Generator) -> None:
-        """Errors of an inertial IMU, where one is fitted."""
+        """Draw the errors of an inertial IMU, if the robot has one."""
         bias = self._bias
         sensor = self._kind_of_world[world].config.scenario.inertial
         bias["gyro"][world] = bias["specific_force"][world] = 0.0
@@ -289,7 +226,7 @@ class WalkTask(Task):
             config = self._kind_of_world[world].config
             robot = self._robots[world].with_exact_sensors()
             model, rest = placed_robot(config, robot)  # pyright: ignore[reportArgumentType]  frozen models can be hashed
-            simulation.take(world, model)
+            simulation.set_model(world, model)
             simulation.qpos[world] = rest.qpos
             simulation.qvel[world] = 0.0
             simulation.act[world] = rest.act
@@ -298,11 +235,11 @@ class WalkTask(Task):
         simulation.refresh(worlds)
 
     def _disturb(self) -> None:
-        """Push the torso where and when the scenario says."""
-        if self._pushes:
-            since = self._worlds[self._row]["truth"]["step"] - self._push_begin
-            active = (since >= 0) & (since < self._push_steps)
-            force = np.where(active[:, None], self._push_force, 0.0)
+        """Push the torso during the drawn time."""
+        if self._has_pushes:
+            steps = self._worlds[self._row]["truth"]["step"] - self._push_begin
+            is_pushed = (steps >= 0) & (steps < self._push_steps)
+            force = np.where(is_pushed[:, None], self._push_force, 0.0)
             self.simulation.bind("xfrc_applied")[:, self._torso, :3] = force
 
     def _begin_worlds(self, worlds: BoolArray) -> None:
@@ -313,19 +250,18 @@ class WalkTask(Task):
         state = (self._physics, self._step, self._walker)
         return kernels.sense_walk(*state, control, *kernels.EVERY_WORLD)
 
-    def _show_worlds(self, observed: Array) -> None:
-        kernels.show_walk(self._step, self._walker, observed)
+    def _observe_worlds(self, observation: Array) -> None:
+        kernels.observe_all_walkers(self._step, self._walker, observation)
 
     @property
     def _physics(self) -> tuple[Any, ...]:
-        """`kernels.Physics`."""
+        """Parts of `kernels.Physics`."""
         return self.simulation.views(kernels.Physics._fields)
 
     @property
     def _walker(self) -> tuple[Any, ...]:
-        """`kernels.Walker`."""
-        fixed = (self._walk_constants, self._plan_rows)
-        return (*fixed, self._bias, self._inertial, self._walk_columns)
+        """Parts of `kernels.Walker`."""
+        return self._walk_constants, self._plan_rows, self._bias, self._inertial, self._walk_columns
 
     def _signals(self, joints: Records, worlds: Records) -> Signals:
         truth = worlds["truth"]
@@ -345,19 +281,19 @@ class WalkTask(Task):
             "pelvis_pitch": truth["pitch"].copy(),
             "pelvis_error": truth["tilt"].copy(),
             "pelvis_height": truth["pelvis"][:, 2].copy(),
-            **_parts("zmp", truth["zmp"].copy()),
-            **_parts("zmp_reference", zmp_ref),
+            **_components("zmp", truth["zmp"].copy()),
+            **_components("zmp_reference", zmp_ref),
             "zmp_deviation": np.hypot(deviation[:, 0], deviation[:, 1]),
-            **_parts("zmp_deviation", deviation),
+            **_components("zmp_deviation", deviation),
             "zmp_in_feet": np.hypot(in_feet[:, 0], in_feet[:, 1]),
-            **_parts("zmp_in_feet", in_feet),
+            **_components("zmp_in_feet", in_feet),
             "foot_drift": np.hypot(drift[:, 0], drift[:, 1]),
-            **_parts("foot_drift", drift.copy()),
+            **_components("foot_drift", drift.copy()),
             "link_error": rms(error),
-            "link_error_lowest": -highest(-error),
-            "link_error_highest": highest(error),
+            "link_error_lowest": -row_maxima(-error),
+            "link_error_highest": row_maxima(error),
             "deflection": rms(deflection),
-            "joint_torque": highest(np.abs(spring_torque(joints))),
+            "joint_torque": row_maxima(np.abs(spring_torque(joints))),
             "servo_torque": truth["servo_torque"].copy(),
             "command_rate": truth["command_rate"].copy(),
             "force_left": truth["force"][:, LEFT].copy(),
@@ -368,155 +304,64 @@ class WalkTask(Task):
             "support": timing.support[row],
             "position_error": np.hypot(*(middle - plan.origin[row]).T),
             "heading_error": heading_error(truth["quaternion"], plan.heading[row]),
-            "early_touchdown": self._earliness(truth, row),
+            "early_touchdown": self._early_touchdown_s(truth, row),
         }
 
     def masks(self, sample: Sample) -> dict[str, BoolArray]:
-        """Masks of the scored steps, of their phases and blocks, and where there is a ZMP."""
+        """Return masks of the scored steps, their phases and blocks, all also with a ZMP."""
         truth = sample.worlds["truth"]
         loaded = ~np.isnan(truth["zmp"][:, 0])
         phases = self._phases[:, self._plan_row(truth)]
-        parts = (*tables.PHASES, *tables.BLOCKS)
-        names = [f"{name}_loaded" for name in parts]
+        names = (*tables.PHASES, *tables.BLOCKS)
+        loaded_names = [f"{name}_loaded" for name in names]
         return {
-            **dict(zip(["scored", *parts, "touchdown"], phases, strict=True)),
-            **dict(zip(["loaded", *names], phases[:-1] & loaded, strict=True)),
+            **dict(zip(["scored", *names, "touchdown"], phases, strict=True)),
+            **dict(zip(["loaded", *loaded_names], phases[:-1] & loaded, strict=True)),
             "unloaded": phases[0] & ~loaded,
             "end": truth["step"] == self.num_steps,
         }
 
     def _plan_row(self, truth: Records) -> IntArray:
-        """Rows of the plan's tables."""
+        """Rows in the plan's tables."""
         return np.minimum(truth["step"], self.num_steps)
 
-    def _earliness(self, truth: Records, row: IntArray) -> Array:
-        """By how much the swing foot of the last swing touched down before its time [s]."""
+    def _early_touchdown_s(self, truth: Records, row: IntArray) -> Array:
+        """Time between the actual and the planned touch-down of the last swing [s]."""
         since = truth["contact_since"]
-        early = (truth["step"] - since) * self.config.control_period_s
-        return np.where(self._phases[TOUCHDOWN, row] & (since >= 0), early, 0.0)
+        early_s = (truth["step"] - since) * self.config.control_period_s
+        return np.where(self._phases[TOUCHDOWN, row] & (since >= 0), early_s, 0.0)
 
 
 def _joint_plan(walk: WalkPlan, *_: Any) -> Plan:
-    """A walk plan as the joints' reference, the same in all episodes."""
+    """Return a walk plan as the joints' reference, the same in all episodes."""
     scored = walk.timing.scored
-    nowhere = np.full(len(scored), -1, dtype=np.int64)
-    return Plan(walk.q, walk.q_dot, walk.q_ddot, scored, nowhere)
+    no_window = np.full(len(scored), -1, dtype=np.int64)
+    return Plan(walk.q, walk.q_dot, walk.q_ddot, scored, no_window)
 
 
-def _plan_rows(plan: WalkPlan, config: WalkConfig) -> Records:
-    """The plan as a control step needs it, one row per step."""
-    timing = plan.timing
-    steps = np.arange(plan.num_steps + 1)
-    rows = np.zeros(len(steps), records.ROW_OF_PLAN)
-    is_late = timing.swing > 0.5
-    halves = np.where(is_late, kernels.SECOND_HALF, kernels.FIRST_HALF)
-    imu_hz = config.scenario.pelvis_imu.rate_hz
-    rows["clock"] = np.column_stack([timing.time, timing.swing, timing.support])
-    rows["share"] = plan.share
-    rows["zmp"] = plan.zmp
-    rows["ankles"] = plan.ankles
-    rows["half_of_swing"] = np.where(timing.single, halves, 0)
-    rows["swing_foot"] = RIGHT - timing.support
-    rows["imu_is_due"] = is_due(steps, imu_hz, config.control_period_s)
-    rows["weight"] = np.where(timing.walking, 1.0, config.reward.standing)
-    rows.flags.writeable = False
-    return rows
-
-
-def _phase_rows(plan: WalkPlan) -> BoolArray:
-    """Scored steps, as in `PHASES` and `BLOCKS`, and planned touch-downs, by control step."""
-    timing = plan.timing
-    single = timing.single
-    touchdown = np.zeros_like(single)
-    touchdown[1:] = single[:-1] & ~single[1:]
-    all_of_it = np.ones_like(single)
-    gait = plan.gait
-    first = timing.step < gait.settling_steps + tables.BLOCK_STEPS
-    last = timing.step >= gait.num_steps - tables.BLOCK_STEPS
-    of_walk = (all_of_it, ~single, single, timing.transition)
-    return timing.scored & np.stack([*of_walk, first, last, touchdown])
-
-
-def _constants_of(kind: _Kind, is_delayed: bool, is_inertial: bool) -> Records:  # noqa: ARG001
-    """Constants of a robot, one record of `CONSTANTS`.
-
-    Args:
-        kind: Robots of its scenario.
-        is_delayed: True if its measurements are shown a step late.
-        is_inertial: True if its IMU computes its attitude.
-    """
-    config = kind.config
-    scenario = config.scenario
-    period_s = config.control_period_s
-    noise = np.zeros(1, records.NOISE)
-    for group, deviation in tables.sensor_noise(scenario, is_inertial).items():
-        noise[group] = deviation
-    model = kind.model
-    feet = [model.body(f"{side}_foot").id for side in SIDES]
-    gravity = model.opt.gravity.copy()
-    sensors = FootSensors(model.body_mass[feet], model.body_ipos[feet], gravity)
-    g = biped(config.robot).gravity  # pyright: ignore[reportArgumentType]  frozen models can be hashed
-    loaded_n = UNLOADED_SHARE * float(model.body_mass.sum()) * g
-    terms = records.SCORES.names or ()
-    weights = {term: getattr(config.reward, term) for term in terms}
-    walked_s = STAND_S + _STEPS_BEFORE_SKIP * config.gait.step_period_s
-    return one(
-        records.CONSTANTS,
-        ankles=[model.site(f"{side}_ft").id for side in SIDES],
-        foot_com=sensors.com,
-        foot_weight=sensors.weight,
-        noise=noise,
-        imu_bias_rad=scenario.pelvis_imu.bias_rad,
-        imu_sine_error_rad=scenario.pelvis_imu.sine_error_rad,
-        lowest_pelvis_m=FALL_HEIGHT_SHARE * config.gait.hip_height_m,
-        highest_tilt_rad=FALL_TILT_RAD,
-        loaded_n=loaded_n,
-        # sensors that carry nothing stand for a ground that carries the feet
-        zmp_n=loaded_n + float(model.body_mass[feet].sum()) * g,
-        weights=one(records.SCORES, **weights),
-        skips_at=round(walked_s / period_s),
-    )
-
-
-def _inertial(fits: Sequence[tuple[_Kind, bool, bool]], gravity_m_s2: float) -> Records | None:
-    """Rows of `INERTIAL`, one for every kind of world; None where no robot has such an IMU."""
-    if not any(is_inertial for _, _, is_inertial in fits):
-        return None
-    rows = np.zeros(len(fits), records.INERTIAL)
-    for row, (kind, _, is_inertial) in zip(rows, fits, strict=True):
-        row["is_fitted"] = is_inertial
-        row["time_constant_s"] = kind.config.scenario.inertial.time_constant_s
-    rows["gravity_m_s2"] = gravity_m_s2
-    return rows
-
-
-def _parts(name: str, vectors: Array) -> Signals:
+def _components(name: str, vectors: Array) -> Signals:
     """Components of vectors in the plane, (rows, 2)."""
     return {f"{name}_x": vectors[:, 0], f"{name}_y": vectors[:, 1]}
 
 
 def heading_error(quaternion: Array, planned: Array) -> Array:
-    """Heading (of yaw, pitch, roll) less the planned one, within half a turn, (n,) [rad].
+    """Heading (of yaw, pitch, roll) minus the planned one, within half a turn, (n,) [rad].
 
     Args:
         quaternion: Orientation w, x, y, z, (n, 4).
-        planned: Heading, counted over full turns, (n,) [rad].
+        planned: Planned heading, continuous over full turns, (n,) [rad].
     """
     w, x, y, z = quaternion.T
     error = np.arctan2(2.0 * (x * y + w * z), 1.0 - 2.0 * (y * y + z * z)) - planned
     return error - 2.0 * np.pi * np.round(error / (2.0 * np.pi))
 
 
-TOUCHDOWN = -1
-"""Row of the touch-downs among the phases."""
-
-
-def highest(values: Array) -> Array:
+def row_maxima(values: Array) -> Array:
     """Maximum over the last axis of (n, m); NumPy is several times as fast over a first axis."""
     return values.T.copy().max(axis=0)
 
 
 def rms(values: Array) -> Array:
-    """Root of the mean square over the last axis of (n, m)."""
-    # of one kind, for which it is compiled
+    """Root mean square over the last axis of (n, m)."""
+    # the kernel is compiled for contiguous arrays
     return kernels.rms_of_rows(np.array(values, order="C"))
