@@ -15,7 +15,7 @@ from typing import Literal, NoReturn, TypeVar
 import numpy as np
 from pydantic import TypeAdapter
 
-from elastic_env.core.errors import unknown_name
+from elastic_env.core.errors import ConfigurationError, unknown_name
 from elastic_env.core.files import read_rows
 from elastic_env.core.signals import Array, Parameter
 from elastic_env.hardware.errors import HardwareError
@@ -275,6 +275,19 @@ def servo_model(number: int) -> ServoModel:
             "another model could move it: add its table to elastic_env/hardware/buses"
         )
     return known[number]
+
+
+def model_number(name: str) -> int:
+    """Model number of a servo by its name.
+
+    Raises:
+        ConfigurationError: There is no such servo.
+    """
+    numbers = {model.name: number for number, model in servo_models().items()}
+    if name not in numbers:
+        problem = f"no servo {name!r}, as the mounting has it"
+        raise ConfigurationError(f"{problem}; choose from {', '.join(numbers)}")
+    return numbers[name]
 
 
 @functools.cache
