@@ -44,9 +44,8 @@ from elastic_env.hardware.live.arm_state import ArmState, live_table
 from elastic_env.hardware.live.consent import require_consent
 from elastic_env.hardware.live.follower import Follower
 from elastic_env.hardware.live.joint_check import check_joint, require_signs, wrong_sign
-from elastic_env.hardware.live.target_files import read_targets
 from elastic_env.hardware.live.target_streams import Socket, Stream
-from elastic_env.hardware.live.targets import Poses, Targets
+from elastic_env.hardware.live.targets import Poses, Targets, read_targets
 from elastic_env.hardware.safety.supervised_bus import Cycle, SupervisedBus
 from elastic_env.rigid.rigid_body import RigidBody
 from elastic_env.rigid.tree.end_effector import EndEffector

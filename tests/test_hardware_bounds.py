@@ -17,7 +17,7 @@ from elastic_env.hardware.buses.bus import Condition
 from elastic_env.hardware.emulator.launch import EmulatorConfig
 from elastic_env.hardware.errors import FaultError, HardwareError
 from elastic_env.hardware.imu import Attitude, AttitudeError, AttitudeStream, PlausibleAttitudes
-from elastic_env.hardware.safety import supervisor
+from elastic_env.hardware.safety.checks import require_ready
 from elastic_env.hardware.safety.guard import Guard, exceeds, is_outside
 from elastic_env.hardware.safety.realtime import Pace
 from elastic_env.hardware.settings import HardwareSettings, SafetyLimits
@@ -96,7 +96,7 @@ def test_torque_goes_on_where_a_speed_is_known_only(value: float) -> None:
     """Catches a servo at an unknown speed that counts as at rest."""
     condition = Condition(velocity=value, temperature=30.0, temperature_limit=80.0, error="")
     with pytest.raises(FaultError, match="torque goes on at rest"):
-        supervisor.require_ready("servo 1 at one", condition, 80.0)
+        require_ready("servo 1 at one", condition, 80.0)
 
 
 @no_number

@@ -111,7 +111,7 @@ class Check(Model):
             checks.append(BusCheck("IMU", f"{angles} rad"))
         table = make_table(f"check of {self.port}", ["", "", "what to do"], [], left=3)
         for check in checks:
-            cells = (check.what, check.value, "fine" if check.is_good else check.cure)
+            cells = (check.name, check.value, "fine" if check.is_good else check.cure)
             style = "" if check.is_good else "bold yellow"
             table.add_row(*map(escape, cells), style=style)
         console.print(table)

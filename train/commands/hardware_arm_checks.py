@@ -56,11 +56,11 @@ def check_servos(setup: ArmSetup, bus: ServoBus, console: Console) -> None:
     if not bad:
         console.print(f"{len(checks)} checks of the servos: all fine")
         return
-    rows = [(check.what, check.value, check.cure) for check in bad]
+    rows = [(check.name, check.value, check.cure) for check in bad]
     console.print(make_table("to mend", ["", "", "what to do"], rows, left=3))
     for check in bad:
         if check.is_vital:
-            problem = f"{check.what} is {check.value}: {check.cure}"
+            problem = f"{check.name} is {check.value}: {check.cure}"
             raise HardwareError(f"nothing can move yet: {problem}")
 
 

@@ -12,9 +12,8 @@ from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
 from elastic_env.hardware.live.arm import Uncompensated
 from elastic_env.hardware.live.arm_state import ArmState
-from elastic_env.hardware.live.target_files import read_targets
 from elastic_env.hardware.live.target_streams import Socket, Stream
-from elastic_env.hardware.live.targets import Poses, Targets
+from elastic_env.hardware.live.targets import Poses, Targets, read_targets
 from train.commands.hardware_arm import ArmOptions, ArmSetup
 from train.commands.hardware_arm_motion import move_arm
 

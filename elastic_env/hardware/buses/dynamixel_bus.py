@@ -4,8 +4,9 @@ from typing_extensions import override
 
 from elastic_env.hardware.buses import packets
 from elastic_env.hardware.buses.bus import ServoInfo
+from elastic_env.hardware.buses.packet_line import STRANGE, Status
 from elastic_env.hardware.buses.packets import Packet
-from elastic_env.hardware.buses.servo_bus import STRANGE, ServoBus, Status
+from elastic_env.hardware.buses.servo_bus import ServoBus
 
 
 class DynamixelBus(ServoBus):

@@ -4,8 +4,9 @@ from typing_extensions import override
 
 from elastic_env.hardware.buses import feetech_packets, packets
 from elastic_env.hardware.buses.bus import ServoInfo
+from elastic_env.hardware.buses.packet_line import Status
 from elastic_env.hardware.buses.packets import Packet
-from elastic_env.hardware.buses.servo_bus import ServoBus, Status
+from elastic_env.hardware.buses.servo_bus import ServoBus
 from elastic_env.hardware.buses.servo_models import servo_models
 
 _WHO = ("firmware_version", "model_number")
