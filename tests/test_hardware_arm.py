@@ -54,7 +54,7 @@ from tests.hardware_trials.trials import compare_replies
 from tests.lines import looped
 from tests.test_hardware_arm_servos import servos
 from tests.test_hardware_faults import SERVO, Case, named
-from train.commands import hardware_arm_motion, hardware_compensate
+from train.commands import hardware_arm_dry_run, hardware_compensate
 from train.commands.cli import main
 from train.commands.hardware import Emulate
 from train.commands.hardware_arm import ArmSetup
@@ -296,7 +296,7 @@ def test_a_wrong_zero_shows_in_the_loads(own: str, tmp_path: Path) -> None:
         check_joints(arm, setup, PlainConsole(file=text, width=120))
         said.append(text.getvalue())
     assert "zero_rad" not in said[0]
-    assert "light: its load does not tell the sign" in said[0]
+    assert "light: its load does not show the sign" in said[0]
     assert "look at zero_rad" in said[1]
 
 
@@ -1083,7 +1083,9 @@ def test_an_arm_that_is_not_as_the_files_say_is_one_sentence_at_the_command_line
 ) -> None:
     """Catches a traceback, a wrong cause, and an exit code of success."""
     config = EmulatorConfig(model_number=777, ids=tuple(range(1, 7)), arm=emulated())
-    monkeypatch.setattr(hardware_arm_motion, "emulator_config", lambda _: config.replace(**changes))
+    monkeypatch.setattr(
+        hardware_arm_dry_run, "emulator_config", lambda _: config.replace(**changes)
+    )
     files = ["--robot", ROBOT, "--joints", str(JOINTS), "--mounting", str(MOUNTING)]
     files += ["--targets", str(FOLDER / "so101_poses.csv"), "--output", str(tmp_path / "run")]
     with pytest.raises(SystemExit) as ended:

@@ -110,7 +110,7 @@ def test_a_link_that_is_nowhere_stops_the_motion(still: StillBus, what: str, val
     testbed.qpos[0, at.theta[0]] = 0.0
     testbed.qvel[0, at.theta_dot[0]] = 0.1
     given = {"q": 0.0, "age": 0.01}
-    testbed._require_together(given["q"], given["age"])
+    testbed._require_small_deflection(given["q"], given["age"])
     if what == "theta":
         testbed.qpos[0, at.theta[0]] = value
     elif what == "rate":
@@ -118,10 +118,10 @@ def test_a_link_that_is_nowhere_stops_the_motion(still: StillBus, what: str, val
     else:
         given[what] = value
     if what == "age" and value == -math.inf:
-        testbed._require_together(given["q"], given["age"])  # no age widens nothing
+        testbed._require_small_deflection(given["q"], given["age"])  # no age widens nothing
         return
     with pytest.raises(HardwareError, match="largest_deflection_rad"):
-        testbed._require_together(given["q"], given["age"])
+        testbed._require_small_deflection(given["q"], given["age"])
 
 
 @no_number

@@ -8,15 +8,9 @@ from rich.console import Console
 from elastic_env.hardware.buses.servo_bus import ServoBus
 from elastic_env.hardware.buses.servo_models import model_number
 from elastic_env.hardware.errors import HardwareError
+from elastic_env.hardware.live import joint_check
 from elastic_env.hardware.live.arm import Arm
 from elastic_env.hardware.live.consent import answers_yes
-from elastic_env.hardware.live.joint_check import (
-    LEAST_LOAD_NM,
-    JointCheck,
-    check_joint,
-    require_signs,
-    torque_tolerance,
-)
 from elastic_env.hardware.safety.checks import check_bus
 from train.commands.hardware_arm import ArmSetup
 from train.runs.console import make_table
@@ -71,14 +65,15 @@ def check_joints(arm: Arm, setup: ArmSetup, console: Console) -> None:
         HardwareError: A joint hardly moves, or its sign is wrong.
     """
     console.print(f"moving each joint by ±{setup.options.nudge_rad:g} rad")
-    checks: list[JointCheck] = []
+    checks: list[joint_check.JointCheck] = []
     for joint in range(len(setup.joints)):
-        checks.append(check_joint(arm, joint, setup.options.nudge_rad))
+        checks.append(joint_check.check_joint(arm, joint, setup.options.nudge_rad))
         load = float(setup.links.gravity_torque(arm.start)[joint])
-        if abs(load) < LEAST_LOAD_NM:
+        if abs(load) < joint_check.LEAST_LOAD_NM:
             _ask_direction(arm, setup, joint, checks[-1].first_move)
     arm.hold()  # while tables are drawn
-    require_signs(setup.servos, checks, setup.links.gravity_torque, setup.compensator.settings)
+    settings = setup.compensator.settings
+    joint_check.require_signs(setup.servos, checks, setup.links.gravity_torque, settings)
     rows = [_joint_row(setup, joint, check) for joint, check in enumerate(checks)]
     head = ["joint", "follows", "load [N·m]", "model", "k_p", "file", ""]
     console.print(make_table("each joint moved a little", head, rows))
@@ -88,14 +83,14 @@ def check_joints(arm: Arm, setup: ArmSetup, console: Console) -> None:
             console.print(f"{remark}: {explanation}")
 
 
-def _joint_row(setup: ArmSetup, joint: int, check: JointCheck) -> list[str]:
+def _joint_row(setup: ArmSetup, joint: int, check: joint_check.JointCheck) -> list[str]:
     """Cells of a joint in the table; the last one is its remark."""
     name = setup.joints[joint]
     settings = setup.compensator.settings[name]
     load = float(setup.links.gravity_torque(check.theta)[joint])
     gain = settings.servo.sagging_gain(name)
-    remark = "" if abs(load) >= LEAST_LOAD_NM else "light"
-    if abs(check.torque - load) > torque_tolerance(settings, load, gain):
+    remark = "" if abs(load) >= joint_check.LEAST_LOAD_NM else "light"
+    if abs(check.torque - load) > joint_check.torque_tolerance(settings, load, gain):
         remark = "load"
     if check.gain > 0.0 and max(check.gain / gain, gain / check.gain) > _LARGEST_GAIN_RATIO:
         remark = "k_p"

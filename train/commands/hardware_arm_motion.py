@@ -20,14 +20,10 @@ from elastic_env.hardware.live.targets import Poses, Targets
 from elastic_env.hardware.safety import realtime
 from elastic_env.hardware.safety.supervised_bus import SupervisedBus
 from elastic_env.robots.robot.joints import STIFF_OVER_SERVO
+from train.commands import hardware_arm_dry_run as dry_run
 from train.commands.hardware_arm import ArmSetup
 from train.commands.hardware_arm_checks import check_joints, check_servos
 from train.commands.hardware_arm_display import rest_table, throttled_display
-from train.commands.hardware_arm_dry_run import (
-    emulator_config,
-    stiffened_joints,
-    uncompensated_error,
-)
 from train.commands.hardware_arm_logs import write_servo_logs
 from train.runs.console import print_files
 from train.runs.folders import run_folder
@@ -61,8 +57,8 @@ def move_arm(
         console.print(f"{len(setup.joints)} servos at {setup.settings.port}: {servos}")
         simulation = None
         if options.dry_run:
-            bus = simulation = stack.enter_context(VirtualBus(emulator_config(setup)))
-            if stiffened_joints(setup):
+            bus = simulation = stack.enter_context(VirtualBus(dry_run.emulator_config(setup)))
+            if dry_run.stiffened_joints(setup):
                 console.print(f"rigid joints are emulated with K = {STIFF_OVER_SERVO:g} k_p")
             check_servos(setup, bus.driver, console)
         else:
@@ -85,7 +81,7 @@ def move_arm(
         rests = _follow_targets(arm, targets, setup, folder, console, simulation)
     is_complete = isinstance(targets, Poses) and targets.number == len(targets.poses)
     if options.dry_run and is_complete and not isinstance(compensator, Uncompensated):
-        error = uncompensated_error(setup, make_targets)
+        error = dry_run.uncompensated_error(setup, make_targets)
         console.print(f"without compensation the tip would be off by {1e3 * error:.2f} mm")
     return folder, rests
 
