@@ -10,7 +10,7 @@ from elastic_env.hardware.buses.servo_bus import ServoBus
 
 
 class DynamixelBus(ServoBus):
-    """Dynamixel servos of Protocol 2.0 on a port, see `ServoBus`."""
+    """Dynamixel servos of Protocol 2.0 at a port."""
 
     protocol = "dynamixel"
     rates = packets.RATES
