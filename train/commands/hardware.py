@@ -143,20 +143,18 @@ class Run(Model):
             problem = "--port is needed; see: elastic hardware scan PORT, elastic hardware emulate"
             raise ConfigurationError(problem)
         spec = PolicySpec(name=self.policy)
-        played = Condition(env="hardware", policy=spec, reference=self.reference)
-        arguments = {"reference": played.reference, **arguments}
-        name = played.environment.id
-        env: Any = gymnasium.make(name, disable_env_checker=True, **arguments)
+        condition = Condition(env="hardware", policy=spec, reference=self.reference)
+        arguments = {"reference": condition.reference, **arguments}
+        env_id = condition.environment.id
+        env: Any = gymnasium.make(env_id, disable_env_checker=True, **arguments)
         recorded = {"policy": spec.model_dump(mode="json"), **arguments}
         with contextlib.closing(env):
             policy = make_policy(spec, env)
             with run_folder("hardware", recorded, None, self.output) as folder:
                 steps = control_steps(env, policy, None)
                 metrics = _log_steps(steps, folder / "log.csv", console)
-                text = json.dumps(metrics, indent=2)
-                (folder / "metrics.json").write_text(f"{text}\n")
-        files = "log.csv (every step), metrics.json, config.yaml"
-        console.print(f"Results in {folder}: {files}")
+                (folder / "metrics.json").write_text(f"{json.dumps(metrics, indent=2)}\n")
+        console.print(f"Results in {folder}: log.csv (every step), metrics.json, config.yaml")
 
 
 _COLUMNS = (

@@ -64,12 +64,9 @@ class ArmSetup:
     def __init__(self, options: ArmOptions, joints: Path | None, limit_rad: float = 0.3) -> None:
         self.options = options
         model = compiled_model(options.robot)
-        port = options.port
-        if options.dry_run:
-            if port is not None:
-                problem = "--dry-run plays against an emulated arm: leave --port out"
-                raise ConfigurationError(problem)
-            port = "emulated"
+        if options.dry_run and options.port is not None:
+            raise ConfigurationError("--dry-run plays against an emulated arm: leave --port out")
+        port = "emulated" if options.dry_run else options.port
         overrides = {} if port is None else {"port": port}
         self.settings = load_yaml(options.mounting, ArmSettings, overrides)
         if options.patient:

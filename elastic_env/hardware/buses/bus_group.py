@@ -88,8 +88,7 @@ class BusGroup:
         calls = [partial(_call, bus.confirm_torque_off) for bus in self.buses]
         answers = self._call_all(calls)
         errors = [answer for answer in answers if isinstance(answer, HardwareError)]
-        lists = [answer for answer in answers if isinstance(answer, list)]
-        silent = [name for names in lists for name in names]
+        silent = [name for answer in answers if isinstance(answer, list) for name in answer]
         problems = [str(error) for error in errors]
         if silent:
             cure = f"{', '.join(silent)}: switch the power off"

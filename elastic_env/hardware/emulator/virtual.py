@@ -139,11 +139,10 @@ class VirtualBus(AbstractContextManager["VirtualBus"]):
         """Run no faster than real time from now on, because a user sends targets in real time."""
         self._ahead_s = time.monotonic() - self.now_s
 
-    def enable(self, limits: SafetyLimits | None = None, ranges: Array | None = None) -> Array:
+    def enable(self, limits: SafetyLimits, ranges: Array) -> Array:
         """Switch torque on, see `SupervisedBus.enable`."""
-        ends = None if ranges is None else ranges.tolist()
-        allowed = (limits or SafetyLimits()).model_dump()
-        return np.array(self._request("enable", limits=allowed, ranges=ends)["position"])
+        answer = self._request("enable", limits=limits.model_dump(), ranges=ranges.tolist())
+        return np.array(answer["position"])
 
     def exchange(self, goals: Array, at: float) -> Cycle:
         """Run one control cycle, see `SupervisedBus.exchange`."""

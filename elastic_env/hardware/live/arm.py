@@ -10,7 +10,6 @@ from contextlib import contextmanager
 from typing import Any, Protocol, TypeAlias
 
 import numpy as np
-import numpy.typing as npt
 
 from elastic_env.core.errors import ElasticError
 from elastic_env.core.signals import Array
@@ -35,16 +34,11 @@ _AVERAGED_CYCLES = 10
 class Compensator(Protocol):
     """Computes commands of servos, as `baselines.PositionCompensator` does."""
 
-    def command(
-        self,
-        q_desired: npt.ArrayLike,
-        q_dot: npt.ArrayLike | None = None,
-        q_ddot: npt.ArrayLike | None = None,
-    ) -> Array:
+    def command(self, q_desired: Any, q_dot: Any = None, q_ddot: Any = None) -> Array:
         """Servo command that brings the links to the desired angles, (n,) [rad]."""
         ...
 
-    def link_angle(self, theta: npt.ArrayLike) -> Array:
+    def link_angle(self, theta: Any) -> Array:
         """Link angles for motor encoders, (n,) [rad]."""
         ...
 

@@ -39,9 +39,7 @@ def prefer_realtime(priority: Priority, *, with_threads: bool = False) -> bool:
     gc.collect()
     gc.freeze()
     with contextlib.suppress(OSError, AttributeError):
-        policy = os.SCHED_FIFO
-        if not with_threads:
-            policy |= os.SCHED_RESET_ON_FORK
+        policy = os.SCHED_FIFO | (0 if with_threads else os.SCHED_RESET_ON_FORK)
         os.sched_setscheduler(0, policy, os.sched_param(priority))
         return True
     return False
