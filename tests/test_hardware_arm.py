@@ -39,8 +39,7 @@ from elastic_env.hardware.emulator.launch import EmulatorConfig, Faults, Running
 from elastic_env.hardware.emulator.virtual import VirtualBus
 from elastic_env.hardware.errors import FaultError, HardwareError
 from elastic_env.hardware.live import arm as live
-from elastic_env.hardware.live.arm_log import ArmLog
-from elastic_env.hardware.live.arm_state import ArmState, live_table
+from elastic_env.hardware.live.arm_state import ArmLog, ArmState, live_table
 from elastic_env.hardware.live.consent import require_consent
 from elastic_env.hardware.live.follower import Follower
 from elastic_env.hardware.live.joint_check import check_joint, require_signs, wrong_sign

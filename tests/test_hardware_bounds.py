@@ -204,7 +204,6 @@ def _stream(sample: Callable[[], Attitude], monkeypatch: pytest.MonkeyPatch) -> 
     stream._plausible = PlausibleAttitudes(0.05)
     # type: ignore[assignment]
     stream._shared = SimpleNamespace(get=sample)
-    stream._lock = None
     stream._process = SimpleNamespace(poll=lambda: None, stderr=None)  # type: ignore[assignment]
     monkeypatch.setattr(stream, "close", lambda: None)
     return stream

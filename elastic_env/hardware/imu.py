@@ -13,7 +13,7 @@ import os
 import struct
 import subprocess
 import time
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import astuple, dataclass
 from typing import Any, Literal
 
@@ -161,10 +161,12 @@ class AttitudeStream(AbstractContextManager["AttitudeStream"]):
         self.port = port
         self._oldest_s = oldest_s
         self._plausible = PlausibleAttitudes(oldest_s)
-        self._lock: int | None = lock_port(port)
+        self._resources = ExitStack()
+        self._resources.callback(os.close, lock_port(port))
         self._process: Process | None = None
         try:
             self._process = self._start(baudrate)
+            self._resources.callback(end_child, self._process, _END_S)
             deadline = time.monotonic() + _WAIT_S
             while self._shared.get() is None:
                 if self._process.poll() is not None or time.monotonic() > deadline:
@@ -191,16 +193,8 @@ class AttitudeStream(AbstractContextManager["AttitudeStream"]):
 
     def close(self) -> None:
         """End the reader and release the port; a second call does nothing."""
-        process = self._process
-        lock = self._lock
         self._process = None
-        self._lock = None
-        try:
-            if process is not None:
-                end_child(process, _END_S)
-        finally:
-            if lock is not None:
-                os.close(lock)
+        self._resources.close()
 
     def __exit__(self, *_: object) -> None:
         self.close()

@@ -12,8 +12,7 @@ from elastic_env.core.signals import Array
 from elastic_env.hardware.buses.protocols import BUSES
 from elastic_env.hardware.emulator.virtual import VirtualBus
 from elastic_env.hardware.live.arm import Arm, Compensator, Uncompensated
-from elastic_env.hardware.live.arm_log import ArmLog
-from elastic_env.hardware.live.arm_state import ArmState, live_table, state_message
+from elastic_env.hardware.live.arm_state import ArmLog, ArmState, live_table, state_message
 from elastic_env.hardware.live.consent import require_consent
 from elastic_env.hardware.live.target_streams import Socket, Stream
 from elastic_env.hardware.live.targets import Poses, Targets

@@ -160,10 +160,8 @@ class Access:
         is_socket = bool(request.values("Upgrade"))
         _require(path.rstrip("/").lower() != _UPLOAD, "this page takes no uploads")
         has_body = any(map(request.values, ("Content-Length", "Transfer-Encoding")))
-        is_download = method == "GET" and not has_body
-        _require(is_download, "this page only answers GET without a body")
-        is_known = not is_socket or path in _SOCKETS
-        _require(is_known, f"WebSockets are {', '.join(_SOCKETS)}")
+        _require(method == "GET" and not has_body, "this page only answers GET without a body")
+        _require(not is_socket or path in _SOCKETS, f"WebSockets are {', '.join(_SOCKETS)}")
         query = "&".join(others)
         return AdmittedRequest(f"{path}?{query}" if query else path, is_socket, has_address)
 
@@ -177,8 +175,7 @@ class Access:
         origins = [origin.lower() for origin in request.values("Origin")]
         is_own = len(hosts) == 1 and self._is_own(hosts[0])
         _require(is_own, f"the Host is not this page's: {_CURE}")
-        is_same_page = origins in ([], [f"http://{hosts[0]}"])
-        _require(is_same_page, "the request comes from another page")
+        _require(origins in ([], [f"http://{hosts[0]}"]), "the request comes from another page")
 
     def _is_own(self, host: str) -> bool:
         """Return True if a Host is one of the names of the page, with its port."""

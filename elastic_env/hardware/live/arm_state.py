@@ -1,11 +1,18 @@
-"""State of an arm in one control cycle: as arrays, as a message, and as a table."""
+"""State of an arm in one control cycle: as arrays, message, table, and row of a log."""
 
+import csv
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import TextIO
+
+import numpy as np
 
 from elastic_env.core.signals import Array, BoolArray
 from elastic_env.hardware.live.targets import Targets
+
+_LOGGED = ("target", "desired", "command", "theta", "link", "torque", "temperature")
+_UNITS = {"torque": "N·m", "temperature": "°C"}
 
 
 @dataclass(frozen=True)
@@ -59,13 +66,8 @@ def state_message(state: ArmState, joints: Sequence[str]) -> dict[str, object]:
         pairs = zip(joints, values, strict=True)
         return {name: float(value) if math.isfinite(value) else None for name, value in pairs}
 
-    return {
-        "time_s": state.time_s,
-        "theta": by_joint(state.theta),
-        "link": by_joint(state.link),
-        "torque": by_joint(state.torque),
-        "temperature": by_joint(state.temperature),
-    }
+    signals = ("theta", "link", "torque", "temperature")
+    return {"time_s": state.time_s, **{name: by_joint(getattr(state, name)) for name in signals}}
 
 
 def live_table(state: ArmState, joints: Sequence[str], counts: Counts, targets: Targets) -> str:
@@ -86,3 +88,28 @@ def live_table(state: ArmState, joints: Sequence[str], counts: Counts, targets: 
         + (f", {targets.refused} lines refused" if targets.refused else "")
     )
     return "\n".join(lines)
+
+
+class ArmLog:
+    """Writes every cycle of a motion as a row of a CSV file.
+
+    Args:
+        file: Open file that gets the rows.
+        joints: Names of the joints.
+    """
+
+    def __init__(self, file: TextIO, joints: Sequence[str]) -> None:
+        self._writer = csv.writer(file, lineterminator="\n")
+        columns = [
+            f"{signal}.{joint} [{_UNITS.get(signal, 'rad')}]"
+            for signal in _LOGGED
+            for joint in joints
+        ]
+        self._writer.writerow(["time [s]", *columns, "late [s]", "held [1]", "target [1]"])
+
+    def write(self, state: ArmState, number: int) -> None:
+        """Write one cycle, with the number of its target."""
+        values = np.concatenate([getattr(state, signal) for signal in _LOGGED])
+        cells = [f"{value:.6g}" for value in values.tolist()]
+        end = [f"{state.late_s:.6f}", int(state.is_held), number]
+        self._writer.writerow([f"{state.time_s:.6f}", *cells, *end])
