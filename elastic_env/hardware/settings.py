@@ -59,8 +59,7 @@ class SafetyLimits(Model):
         Returns:
             The option that raises the limit, "" if it is already the most patient one.
         """
-        is_most = getattr(self, name) >= PATIENT_LIMITS[name]
-        return "" if is_most else "; for an emulator: --patient"
+        return "" if getattr(self, name) >= PATIENT_LIMITS[name] else "; for an emulator: --patient"
 
 
 class HardwareSettings(Model):

@@ -1,4 +1,4 @@
-"""What an arm's motion shows on the console: a live table now and then, a summary at the end."""
+"""Output of an arm's motion on the console: a live table now and then, a table at the end."""
 
 import contextlib
 import time

@@ -137,8 +137,7 @@ class PacketLine(ABC):
             self.port.clearPort()
             sent = self.port.writePort(wire)
         if sent != len(wire):
-            taken = f"{sent} of {len(wire)} bytes were taken"
-            raise ReplyError(f"cannot send at {self.name}: {taken}")
+            raise ReplyError(f"cannot send at {self.name}: {sent} of {len(wire)} bytes were taken")
 
     def _receive(self) -> Status | None:
         """Wait for the next reply; None if none comes in time."""

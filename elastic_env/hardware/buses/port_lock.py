@@ -31,8 +31,7 @@ def lock_port(name: str) -> int:
         raise cannot_open(name, error.errno, str(error.strerror)) from None
     try:
         if not os.isatty(descriptor):
-            problem = f"it is no serial port; {_found_ports()}"
-            raise PortError(f"cannot open the port {name}: {problem}")
+            raise PortError(f"cannot open the port {name}: it is no serial port; {_found_ports()}")
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         os.close(descriptor)

@@ -150,7 +150,7 @@ def configure_hardware(port: Any = None, **arguments: Any) -> HardwareTestbedTas
     scenario = arguments.pop("scenario", SCENARIO)
     if scenario not in (SCENARIO, "nominal"):
         raise HardwareError(
-            f"a scenario is of a simulation; on hardware it is what it is, got {quote(scenario)}"
+            f"scenarios are for simulations; hardware has none, got {quote(scenario)}"
         )
     settings = {name: arguments.pop(name) for name in settings_names if name in arguments}
     config = configure_testbed(scenario="ideal", **arguments)
@@ -160,8 +160,7 @@ def configure_hardware(port: Any = None, **arguments: Any) -> HardwareTestbedTas
 def make(render_mode: str | None = None, **arguments: Any) -> ElasticEnv:
     """Make the environment; arguments as in `configure_hardware`."""
     task = configure_hardware(**arguments)
-    picture = partial(TestbedPicture, task.config.pendulum)
-    return ElasticEnv(task, render_mode, picture, task.plant)
+    return ElasticEnv(task, render_mode, partial(TestbedPicture, task.config.pendulum), task.plant)
 
 
 def make_vector(

@@ -249,10 +249,10 @@ class ServoPlant:
                 break
             missed += 1
         self._store_measurements(cycle)
-        torque = float(cycle.states.torque[0])
+        torque = self.settings.direction * float(cycle.states.torque[0])
         period_s = cycle.states.time_s - self._read_s
         timing = (late_s, period_s, overruns, missed, self.record.limited + is_limited)
-        self.record = CycleRecord(self.settings.direction * torque, *timing)
+        self.record = CycleRecord(torque, *timing)
         self._read_s = cycle.states.time_s
 
     def _store_measurements(self, cycle: Cycle) -> None:
@@ -291,5 +291,5 @@ class ServoPlant:
                 f"the link, by the IMU at {settings.imu_port}, is {deflection:+.2f} rad from the "
                 "servo's angle, more than largest_deflection_rad "
                 f"{settings.largest_deflection_rad:g}: correct imu_sign, imu_axis and "
-                "imu_offset_rad of the mounting, or look what has come loose"
+                "imu_offset_rad of the mounting, or check what has come loose"
             )

@@ -140,8 +140,7 @@ class Guard:
         motion = np.stack([states.position, states.velocity, states.torque])
         unreal = is_fresh & ~np.isfinite(motion).all(axis=0)
         if unreal.any():
-            servos = self._list(unreal)
-            return f"position, velocity or torque of {servos} is not a finite number"
+            return f"position, velocity or torque of {self._list(unreal)} is not a finite number"
         if states.has_alert.any():
             return "a servo reports a hardware error"
         self._without_reply = np.where(is_fresh, 0, self._without_reply + 1)

@@ -47,8 +47,7 @@ def child_command(module: str, *arguments: str) -> list[str]:
     """
     names = dict.fromkeys((_PACKAGE, module.partition(".")[0]))
     folders = os.pathsep.join(str(_folder(name)) for name in names)
-    this = str(Path(__file__).resolve())
-    return [sys.executable, "-P", this, folders, module, *arguments]
+    return [sys.executable, "-P", str(Path(__file__).resolve()), folders, module, *arguments]
 
 
 def start_child(module: str, *arguments: str, **options: Any) -> Process:

@@ -144,8 +144,7 @@ class SupervisedBus(contextlib.AbstractContextManager["SupervisedBus"]):
         self._is_enabled = True
         self.is_confirmed_off = False
         ends = None if ranges is None else ranges.tolist()
-        arguments = {"limits": limits.model_dump(), "ranges": ends}
-        answer = self._request("enable", self._slow_s, **arguments)
+        answer = self._request("enable", self._slow_s, limits=limits.model_dump(), ranges=ends)
         self._answer_s = max(limits.hang_s, _LEAST_ANSWER_S)
         self._hint = limits.patience_hint("hang_s") or "; end what else keeps the computer busy"
         return np.array(answer["position"])
@@ -202,8 +201,7 @@ class SupervisedBus(contextlib.AbstractContextManager["SupervisedBus"]):
         # the supervisor refuses to wait longer, or for a moment of nan; max gives 0 for nan as its
         # second value
         wait_s = min(max(0.0, at - time.monotonic()), LONGEST_WAIT_S)
-        within_s = wait_s + self._answer_s
-        return self._request("exchange", within_s, goals=goals.tolist(), at=at)
+        return self._request("exchange", wait_s + self._answer_s, goals=goals.tolist(), at=at)
 
     def disable(self) -> None:
         """Switch torque off.

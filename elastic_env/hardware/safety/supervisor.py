@@ -185,8 +185,7 @@ class Supervisor:
         now = self._clock.monotonic()
         # rounded like the caller's sum: the difference at - now may round above an allowed wait
         if exceeds(at, now + LONGEST_WAIT_S):
-            asked = f"asked for {at - now:.3f} s"
-            raise FaultError(f"a cycle may wait {LONGEST_WAIT_S} s, {asked}")
+            raise FaultError(f"a cycle may wait {LONGEST_WAIT_S} s, asked for {at - now:.3f} s")
         is_held = guard.is_holding
         elapsed_s = min(now - self._commanded_s, LONGEST_WAIT_S)
         allowed, is_limited = guard.command(np.array(goals), elapsed_s)
