@@ -42,7 +42,7 @@ class PacketLine(ABC):
     """A port with servos of one protocol, which answer one instruction after another.
 
     Args:
-        port: Device, such as /dev/ttyUSB0.
+        name: Device of the port, such as /dev/ttyUSB0.
         baudrate: Bits per second; None for `rates[0]`.
 
     Attributes:
