@@ -86,7 +86,7 @@ class ArmSettings(Model):
             if name not in self.joints:
                 raise ConfigurationError(
                     f"joint {name!r} has no servo: give its id under `joints` of the mounting, or"
-                    f" say {name}: held in the file of joints; there are ids of"
+                    f" write {name}: held in the file of joints; there are ids of"
                     f" {', '.join(self.joints)}"
                 )
         return ServoMap(tuple(joints), [self.joints[name] for name in joints])

@@ -218,7 +218,7 @@ class Emulate(Model):
     """
 
     robot: Locator | None = None
-    """Model of an arm behind the servos, MJCF or URDF; ids and servos are those of --mounting."""
+    """Model of an arm, MJCF or URDF, which the servos of --mounting move."""
     joints: Path | None = None
     """YAML file of its joints."""
     mounting: Path | None = None
@@ -269,14 +269,13 @@ class Emulate(Model):
         )
         faults = Faults(**shares, latency_s=1e-3 * self.latency_ms)
         config = config.replace(faults=faults, seed=self.seed)
-        ends = contextlib.suppress(KeyboardInterrupt)
-        with RunningEmulator(config) as emulator, ends:
+        with RunningEmulator(config) as emulator, contextlib.suppress(KeyboardInterrupt):
             ids = " ".join(map(str, config.ids))
             console.print(f"servos {ids} at {emulator.port}")
             check = f"elastic hardware check {emulator.port} --ids {ids}"
-            model = servo_model(config.model_number)
-            if model.protocol != "dynamixel":
-                check += f" --protocol {model.protocol}"
+            protocol = servo_model(config.model_number).protocol
+            if protocol != "dynamixel":
+                check += f" --protocol {protocol}"
             console.print(f"for example: {check}")
             if config.arm is None:
                 console.print(f"IMU at {emulator.imu_port}")
