@@ -39,9 +39,12 @@ from elastic_env.hardware.emulator.launch import EmulatorConfig, Faults, Running
 from elastic_env.hardware.emulator.virtual import VirtualBus
 from elastic_env.hardware.errors import FaultError, HardwareError
 from elastic_env.hardware.live import arm as live
-from elastic_env.hardware.live import target_sources as sources
+from elastic_env.hardware.live.arm_state import ArmLog, ArmState, live_table
 from elastic_env.hardware.live.consent import require_consent
-from elastic_env.hardware.live.target_sources import Follower, Poses, Socket, Stream, read_targets
+from elastic_env.hardware.live.follower import Follower
+from elastic_env.hardware.live.joint_check import check_joint, require_signs, wrong_sign
+from elastic_env.hardware.live.target_streams import Socket, Stream
+from elastic_env.hardware.live.targets import Poses, Targets, read_targets
 from elastic_env.hardware.safety.supervised_bus import Cycle, SupervisedBus
 from elastic_env.rigid.rigid_body import RigidBody
 from elastic_env.rigid.tree.end_effector import EndEffector
@@ -50,11 +53,12 @@ from tests.hardware_trials.trials import compare_replies
 from tests.lines import looped
 from tests.test_hardware_arm_servos import servos
 from tests.test_hardware_faults import SERVO, Case, named
-from train.commands import hardware_arm as command
-from train.commands import hardware_compensate
+from train.commands import hardware_arm_dry_run, hardware_compensate
 from train.commands.cli import main
 from train.commands.hardware import Emulate
-from train.commands.hardware_arm import KnownArm
+from train.commands.hardware_arm import ArmSetup
+from train.commands.hardware_arm_checks import check_joints, check_servos
+from train.commands.hardware_arm_logs import write_servo_logs
 from train.commands.hardware_compensate import (
     Compensate,
     LogPoses,
@@ -236,20 +240,16 @@ def test_a_turned_joint_is_found_by_its_load() -> None:
     direction[turned] = -1
     virtual = virtual_arm(emulated(direction=tuple(direction)))
     arm = begun(virtual, compensator())
-    weighed = [live.weigh(arm, joint, 0.08) for joint in range(6)]
-    known = KnownArm(OPTIONS, JOINTS)
+    checks = [check_joint(arm, joint, 0.08) for joint in range(6)]
+    setup = ArmSetup(OPTIONS, JOINTS)
     with pytest.raises(HardwareError, match=r"'elbow_flex' holds .*write direction: -1 for it"):
-        command.require_signs(
-            arm.servos, weighed, known.links.gravity_torque, known.compensator.settings
-        )
+        require_signs(arm.servos, checks, setup.links.gravity_torque, setup.compensator.settings)
     right = virtual_arm(emulated())
     arm = begun(right, compensator())
-    weighed = [live.weigh(arm, joint, 0.08) for joint in range(6)]
-    command.require_signs(
-        arm.servos, weighed, known.links.gravity_torque, known.compensator.settings
-    )
-    assert weighed[1].gain == pytest.approx(11.95, rel=0.1)
-    assert all(0.5 < own.moved < 1.0 for own in weighed)
+    checks = [check_joint(arm, joint, 0.08) for joint in range(6)]
+    require_signs(arm.servos, checks, setup.links.gravity_torque, setup.compensator.settings)
+    assert checks[1].gain == pytest.approx(11.95, rel=0.1)
+    assert all(0.5 < own.follow_ratio < 1.0 for own in checks)
 
 
 @given(st.integers(0, 1000), st.sampled_from([None, 1, 2, 3]))
@@ -263,7 +263,7 @@ def test_loads_tell_which_sign_is_wrong(seed: int, turned: int | None) -> None:
     sign = np.ones(6)
     if turned is not None:
         sign[turned] = -1.0
-    found = live.wrong_sign(sign * true, sign * q, links.gravity_torque, 0.05 + 0.35 * abs(true))
+    found = wrong_sign(sign * true, sign * q, links.gravity_torque, 0.05 + 0.35 * abs(true))
     assert found in (None, turned)
     if turned is not None and abs(true[turned]) > 0.4:
         assert found == turned
@@ -289,13 +289,13 @@ def test_a_wrong_zero_shows_in_the_loads(own: str, tmp_path: Path) -> None:
         zeros = (0.0, zero, 0.0, 0.0, 0.0, 0.0)
         virtual = virtual_arm(emulated(zero_rad=zeros))
         joints = dict(SETTINGS.joints)
-        known = KnownArm(OPTIONS, joints_file)
+        setup = ArmSetup(OPTIONS, joints_file)
         arm = begun(virtual, compensator(), SETTINGS.replace(joints=joints))
         text = io.StringIO()
-        command._check_joints(arm, known, PlainConsole(file=text, width=120))
+        check_joints(arm, setup, PlainConsole(file=text, width=120))
         said.append(text.getvalue())
     assert "zero_rad" not in said[0]
-    assert "light: its load does not tell the sign" in said[0]
+    assert "light: its load does not show the sign" in said[0]
     assert "look at zero_rad" in said[1]
 
 
@@ -306,7 +306,7 @@ def test_a_joint_that_the_file_leaves_out_is_checked_as_a_rigid_one(tmp_path: Pa
     joints_file.write_text(JOINTS.read_text().replace('"*"', '"[!g]*"'))
     text = io.StringIO()
     arm = begun(virtual_arm(emulated()), compensator())
-    command._check_joints(arm, KnownArm(OPTIONS, joints_file), PlainConsole(file=text, width=120))
+    check_joints(arm, ArmSetup(OPTIONS, joints_file), PlainConsole(file=text, width=120))
     assert re.search(r"gripper .* -\W", text.getvalue())
 
 
@@ -320,11 +320,11 @@ def test_a_held_joint_is_where_the_models_keyframe_has_it(tmp_path: Path) -> Non
     joints_file = tmp_path / "joints.yaml"
     joints_file.write_text(f"{JOINTS.read_text()}\nelbow_flex: held\n")
     options = OPTIONS.replace(robot=str(model), end_effector="tip")
-    known = KnownArm(options, joints_file)
+    setup = ArmSetup(options, joints_file)
     pose = np.delete(HOME, 2)
-    torque = known.compensator.torque(pose)
-    np.testing.assert_allclose(known.links.gravity_torque(pose), torque)
-    np.testing.assert_allclose(known.tool.pose(pose)[0], TOOL.pose(np.insert(pose, 2, 1.2))[0])
+    torque = setup.compensator.torque(pose)
+    np.testing.assert_allclose(setup.links.gravity_torque(pose), torque)
+    np.testing.assert_allclose(setup.tip.pose(pose)[0], TOOL.pose(np.insert(pose, 2, 1.2))[0])
 
 
 def test_an_arm_that_fell_on_its_stops_passes_its_check() -> None:
@@ -337,7 +337,7 @@ def test_an_arm_that_fell_on_its_stops_passes_its_check() -> None:
     arm = begun(bus, compensator())
     assert arm.start[1] == pytest.approx(HIGHEST[1])
     text = io.StringIO()
-    command._check_joints(arm, KnownArm(OPTIONS, JOINTS), PlainConsole(file=text, width=120))
+    check_joints(arm, ArmSetup(OPTIONS, JOINTS), PlainConsole(file=text, width=120))
     follows = re.search(r"shoulder_lift\W+(\d+) %", text.getvalue())
     assert follows is not None
     assert int(follows[1]) > 60
@@ -351,15 +351,15 @@ def test_a_move_away_from_a_stop_is_told_with_its_direction() -> None:
     home[3] = HIGHEST[3] - 0.05
     virtual = virtual_arm(emulated(home=dict(zip(NAMES, home.tolist(), strict=True))))
     arm = begun(virtual, compensator())
-    assert arm.way_off_stops(2, 0.08) == 0.0
-    assert arm.way_off_stops(3, 0.08) == pytest.approx(-0.11, abs=1e-3)
-    weighed = live.weigh(arm, 3, 0.08)
-    assert weighed.first == pytest.approx(-0.19, abs=1e-3)
-    assert 0.5 < weighed.moved < 1.1
+    assert arm.displacement_off_stops(2, 0.08) == 0.0
+    assert arm.displacement_off_stops(3, 0.08) == pytest.approx(-0.11, abs=1e-3)
+    check = check_joint(arm, 3, 0.08)
+    assert check.first_move == pytest.approx(-0.19, abs=1e-3)
+    assert 0.5 < check.follow_ratio < 1.1
     assert goals_of(virtual, 3).max() <= HIGHEST[3] - 0.05 + 1e-3
     virtual.driver.write_register(4, "torque_limit", 5)
     with pytest.raises(HardwareError, match=r"about \+1.5 rad.*at \+1.60. rad, near an end of its"):
-        live.weigh(arm, 3, 0.08)
+        check_joint(arm, 3, 0.08)
 
 
 def test_a_blocked_joint_is_named() -> None:
@@ -369,7 +369,7 @@ def test_a_blocked_joint_is_named() -> None:
     joint = NAMES.index("wrist_flex")
     virtual.driver.write_register(4, "torque_limit", 20)
     with pytest.raises(HardwareError, match=r"'wrist_flex' follows .* % of a move by ±0.08 rad"):
-        live.weigh(arm, joint, 0.08)
+        check_joint(arm, joint, 0.08)
 
 
 def test_a_fault_names_servo_and_joint() -> None:
@@ -421,7 +421,7 @@ def test_desired_angles_reach_every_target_without_overshoot(
         assert follower.q_dot[0] == 0.0
 
 
-def targets_of(text: str, tmp_path: Path) -> sources.Targets:
+def targets_of(text: str, tmp_path: Path) -> Targets:
     path = tmp_path / "targets.csv"
     path.write_text(text)
     return read_targets(path, NAMES, HOME, LOWEST, HIGHEST, hold_s=0.5, period_s=0.01)
@@ -532,12 +532,12 @@ def test_a_client_on_the_loopback_is_told_the_state() -> None:
         target = HOME
         while target[2] != 0.7:
             target = listening.next(HOME, 0.01)  # type: ignore[assignment]
-        listening.tell({"time_s": 1.5})
+        listening.report_state({"time_s": 1.5})
         assert json.loads(client.makefile().readline()) == {"time_s": 1.5}
         client.sendall(b"what\n")
         while not listening.refused:
             listening.next(HOME, 0.01)
-        listening.tell({"time_s": 2.0})
+        listening.report_state({"time_s": 2.0})
         assert "a target needs" in client.makefile().readline() or listening.problem
     while listening.next(HOME, 0.01) is not None:
         pass
@@ -627,7 +627,7 @@ def checked(number: int, **registers: int) -> str:
     bus = looped(servos(number, *range(1, 7), **registers))
     text = io.StringIO()
     console: Console = PlainConsole(file=text, width=200)
-    command._check_servos(KnownArm(OPTIONS, JOINTS), bus, console)
+    check_servos(ArmSetup(OPTIONS, JOINTS), bus, console)
     return text.getvalue()
 
 
@@ -670,16 +670,16 @@ def test_the_log_is_one_that_identify_reads(tmp_path: Path) -> None:
     assert np.sign(states[-1].torque[2]) == -np.sign(read.known[-1])
 
 
-def logged(folder: Path, commands: Any, poses: Array) -> tuple[list[live.ArmState], list[Path]]:
+def logged(folder: Path, commands: Any, poses: Array) -> tuple[list[ArmState], list[Path]]:
     """What an arm does at poses, and the logs of its servos."""
     arm = begun(virtual_arm(emulated()), commands)
     states = list(arm.play(Poses(poses, 0.5)))
     path = folder / "log.csv"
     with path.open("w") as file:
-        log = command.Log(file, NAMES)
+        log = ArmLog(file, NAMES)
         for state in states:
             log.write(state, 0)
-    return states, command.write_servo_logs(path, KnownArm(OPTIONS, JOINTS))
+    return states, write_servo_logs(path, ArmSetup(OPTIONS, JOINTS))
 
 
 @pytest.mark.slow
@@ -712,11 +712,11 @@ def test_an_emulated_arm_needs_all_its_files() -> None:
     """Catches pendulums behind the servos where somebody asked for an arm, and options of
     pendulums that nobody reads."""
     with pytest.raises(ConfigurationError, match="needs --robot, --joints and --mounting"):
-        Emulate(robot=ROBOT)._arm()
+        Emulate(robot=ROBOT)._arm_emulator()
     own = Emulate(robot=ROBOT, joints=JOINTS, mounting=MOUNTING, ids=[7], stiffness=5.0)
     with pytest.raises(ConfigurationError, match="leave out --ids, --stiffness"):
-        own._arm()
-    config = Emulate(robot=ROBOT, joints=JOINTS, mounting=MOUNTING)._arm()
+        own._arm_emulator()
+    config = Emulate(robot=ROBOT, joints=JOINTS, mounting=MOUNTING)._arm_emulator()
     assert config is not None
     assert config.arm is not None
     assert config.arm.order == NAMES
@@ -739,7 +739,7 @@ def test_the_live_table_has_a_line_for_each_joint() -> None:
     virtual = virtual_arm(emulated())
     arm = begun(virtual, compensator())
     state = arm.cycle(HOME)
-    text = command.live_table(state, NAMES, arm, Poses(HOME[None], 1.0))
+    text = live_table(state, NAMES, arm.counts, Poses(HOME[None], 1.0))
     lines = text.splitlines()
     assert [line.split()[0] for line in lines[2:8]] == list(NAMES)
     assert f"{state.target[1]:+8.4f}" in lines[3]
@@ -1047,10 +1047,10 @@ def test_a_patient_command_bears_twice_as_many_missing_replies(tmp_path: Path) -
     mounting.write_text(f"{SOUND}\nlimits: {{slew_rad_s: 1.5}}\n")
     said = []
     for patient in (False, True):
-        known = KnownArm(OPTIONS.replace(mounting=mounting, patient=patient), JOINTS)
+        setup = ArmSetup(OPTIONS.replace(mounting=mounting, patient=patient), JOINTS)
         bus = virtual_arm(emulated())
-        arm = begun(bus, Plain(), known.settings)
-        assert known.settings.limits.slew_rad_s == 1.5
+        arm = begun(bus, Plain(), setup.settings)
+        assert setup.settings.limits.slew_rad_s == 1.5
         arm.cycle(HOME)
         bus.emulator.set_faults({"lost": 1.0})
         with pytest.raises(FaultError) as caught:
@@ -1082,7 +1082,9 @@ def test_an_arm_that_is_not_as_the_files_say_is_one_sentence_at_the_command_line
 ) -> None:
     """Catches a traceback, a wrong cause, and an exit code of success."""
     config = EmulatorConfig(model_number=777, ids=tuple(range(1, 7)), arm=emulated())
-    monkeypatch.setattr(command, "emulator_config", lambda _: config.replace(**changes))
+    monkeypatch.setattr(
+        hardware_arm_dry_run, "emulator_config", lambda _: config.replace(**changes)
+    )
     files = ["--robot", ROBOT, "--joints", str(JOINTS), "--mounting", str(MOUNTING)]
     files += ["--targets", str(FOLDER / "so101_poses.csv"), "--output", str(tmp_path / "run")]
     with pytest.raises(SystemExit) as ended:

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from elastic_env.core.errors import ConfigurationError
-from elastic_env.hardware.buses import feetech_packets, packets, servo_bus
+from elastic_env.hardware.buses import bus_group, feetech_packets, packets
 from elastic_env.hardware.buses.servo_models import Register, servo_model, servo_models
 from elastic_env.hardware.emulator.launch import EmulatorConfig
 from elastic_env.hardware.emulator.servos import EmulatedServo
@@ -281,7 +281,7 @@ def test_servos_without_such_a_limit_lose_their_torque_at_once(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Catches a wait that leaves a testbed under torque for nothing."""
-    monkeypatch.setattr(servo_bus, "_LOWER_S", math.nan)  # no time to sleep
+    monkeypatch.setattr(bus_group, "_LOWER_S", math.nan)  # no time to sleep
     assert {name for name, _ in lowered(54024)} <= {"goal_position", "torque_enable"}
 
 
@@ -318,4 +318,4 @@ def test_a_bus_waits_for_the_wire_of_all_replies(monkeypatch: pytest.MonkeyPatch
     bus.read_states(0.003)
     block = next(filter(bus.models[1].has_temperature, bus.models[1].blocks))
     assert asked[0] == pytest.approx(3.0 + 6 * 0.01 * (6 + len(block)))
-    assert servo_bus._LOWER_S < 0.05
+    assert bus_group._LOWER_S < 0.05

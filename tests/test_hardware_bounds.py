@@ -17,7 +17,7 @@ from elastic_env.hardware.buses.bus import Condition
 from elastic_env.hardware.emulator.launch import EmulatorConfig
 from elastic_env.hardware.errors import FaultError, HardwareError
 from elastic_env.hardware.imu import Attitude, AttitudeError, AttitudeStream, PlausibleAttitudes
-from elastic_env.hardware.safety import supervisor
+from elastic_env.hardware.safety.checks import require_ready
 from elastic_env.hardware.safety.guard import Guard, exceeds, is_outside
 from elastic_env.hardware.safety.realtime import Pace
 from elastic_env.hardware.settings import HardwareSettings, SafetyLimits
@@ -96,7 +96,7 @@ def test_torque_goes_on_where_a_speed_is_known_only(value: float) -> None:
     """Catches a servo at an unknown speed that counts as at rest."""
     condition = Condition(velocity=value, temperature=30.0, temperature_limit=80.0, error="")
     with pytest.raises(FaultError, match="torque goes on at rest"):
-        supervisor.require_ready("servo 1 at one", condition, 80.0)
+        require_ready("servo 1 at one", condition, 80.0)
 
 
 @no_number
@@ -110,7 +110,7 @@ def test_a_link_that_is_nowhere_stops_the_motion(still: StillBus, what: str, val
     testbed.qpos[0, at.theta[0]] = 0.0
     testbed.qvel[0, at.theta_dot[0]] = 0.1
     given = {"q": 0.0, "age": 0.01}
-    testbed._require_together(given["q"], given["age"])
+    testbed._require_small_deflection(given["q"], given["age"])
     if what == "theta":
         testbed.qpos[0, at.theta[0]] = value
     elif what == "rate":
@@ -118,10 +118,10 @@ def test_a_link_that_is_nowhere_stops_the_motion(still: StillBus, what: str, val
     else:
         given[what] = value
     if what == "age" and value == -math.inf:
-        testbed._require_together(given["q"], given["age"])  # no age widens nothing
+        testbed._require_small_deflection(given["q"], given["age"])  # no age widens nothing
         return
     with pytest.raises(HardwareError, match="largest_deflection_rad"):
-        testbed._require_together(given["q"], given["age"])
+        testbed._require_small_deflection(given["q"], given["age"])
 
 
 @no_number
@@ -204,7 +204,6 @@ def _stream(sample: Callable[[], Attitude], monkeypatch: pytest.MonkeyPatch) -> 
     stream._plausible = PlausibleAttitudes(0.05)
     # type: ignore[assignment]
     stream._shared = SimpleNamespace(get=sample)
-    stream._lock = None
     stream._process = SimpleNamespace(poll=lambda: None, stderr=None)  # type: ignore[assignment]
     monkeypatch.setattr(stream, "close", lambda: None)
     return stream

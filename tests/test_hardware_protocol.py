@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.hardware.buses import feetech_packets, packets
 from elastic_env.hardware.buses.dynamixel_bus import DynamixelBus
-from elastic_env.hardware.buses.servo_bus import Status
+from elastic_env.hardware.buses.packet_line import Status
 from elastic_env.hardware.buses.servo_models import (
     LARGEST_TORQUE_NM,
     NUM_BLOCKS,

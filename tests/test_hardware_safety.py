@@ -209,7 +209,7 @@ def test_check_finds_nothing_wrong_with_good_servos(emulator: RunningEmulator) -
         "round trip of a ping",
         "lost replies",
     )  # pseudo-terminals are slow where it is busy
-    assert [one.what for one in checks if not one.is_good and one.what not in of_the_computer] == []
+    assert [one.name for one in checks if not one.is_good and one.name not in of_the_computer] == []
     assert any("54024 H54-200-S500-R" in one.value for one in checks)
 
 
@@ -220,7 +220,7 @@ def test_check_finds_nothing_wrong_with_the_newer_servos() -> None:
         RunningEmulator(EmulatorConfig(model_number=2020)) as newer,
         DynamixelBus(newer.port) as bus,
     ):
-        found = {one.what: one.is_good for one in check_bus(bus, [1]) if one.what.startswith("1: ")}
+        found = {one.name: one.is_good for one in check_bus(bus, [1]) if one.name.startswith("1: ")}
     assert set(found.values()) == {True}
 
 
@@ -230,7 +230,7 @@ def test_a_bad_line_is_seen_by_its_lost_and_damaged_replies(fault: str) -> None:
     with RunningEmulator(EmulatorConfig(seed=5)) as emulator, DynamixelBus(emulator.port) as bus:
         bus.attach([1])
         emulator.faults(**{fault: 0.1})  # from here on the same replies every time
-        found = {one.what: one for one in check_bus(bus, [1])}
+        found = {one.name: one for one in check_bus(bus, [1])}
     assert "cable" in found["lost replies"].cure
     assert not found["lost replies"].is_vital
 
@@ -306,7 +306,7 @@ def test_second_program_is_told_which_port_is_taken(
     ):
         with pytest.raises(PortError, match=emulator.port):
             intrude()
-    assert supervised.read_states().is_fresh.all()
+    assert len(supervised.enable(PATIENT)) == 2
 
 
 def test_a_program_that_takes_the_port_for_an_imus_does_not_disturb_the_motion(
@@ -452,7 +452,8 @@ def test_two_buses_are_read_side_by_side(emulator: RunningEmulator) -> None:
             assert bus.models == [[2020], [54024, 54024]]
             bus.enable(PATIENT)
             cycle(bus, [0.0, 0.0, 0.0], 5)
-            assert len(bus.read_states().position) == 3
+            states = bus.exchange(np.zeros(3), time.monotonic()).states
+            assert len(states.position) == 3
             other.faults(unplugged=True)
             emulator.events()
             with pytest.raises(BusGoneError, match=r"gone .*power"):

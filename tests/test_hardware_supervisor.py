@@ -12,27 +12,24 @@ from collections import deque
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from elastic_env.hardware.buses import packets
 from elastic_env.hardware.buses.dynamixel_bus import DynamixelBus
+from elastic_env.hardware.buses.packet_line import Status
 from elastic_env.hardware.buses.packets import Packet, Parser
-from elastic_env.hardware.buses.servo_bus import Status
 from elastic_env.hardware.buses.servo_models import servo_model
 from elastic_env.hardware.emulator.servos import EmulatedBus, EmulatedServo
 from elastic_env.hardware.errors import BusGoneError, ReplyError
-from elastic_env.hardware.safety import supervised_bus, supervisor
+from elastic_env.hardware.safety import emergency_stop, supervisor
 from elastic_env.hardware.safety.processes import Channel, is_ending
-from elastic_env.hardware.safety.supervised_bus import emergency_stop
 from elastic_env.hardware.safety.supervisor import Supervisor
 from elastic_env.hardware.settings import SafetyLimits
 
 MODEL = servo_model(54024)
 ENABLE = ("enable", {"limits": SafetyLimits().model_dump()})
-READ: tuple[str, dict[str, Any]] = ("read", {})
 
 
 def exchange(*goals: float) -> tuple[str, dict[str, Any]]:
@@ -237,27 +234,6 @@ def test_torque_goes_on_at_rest_only() -> None:
     assert "error" not in answer
 
 
-def test_reading_does_not_count_as_commanding() -> None:
-    """Catches a program that only reads and so keeps torque on for ever, as one that hangs in
-    its control law may."""
-    clock = [0.0]
-
-    class Slow(Line):
-        def read_states(self, timeout_s: float) -> Any:
-            clock[0] += 0.02
-            return super().read_states(timeout_s)
-
-    line = Slow("one", 1)
-    line.port.clock = SimpleNamespace(monotonic=lambda: clock[0], sleep=time.sleep)
-    line.attach([1])
-    *answers, last = served(
-        [line], ENABLE, READ, READ, exchange(0.0), READ, READ, READ, READ, exchange(0.0)
-    )
-    assert not any("error" in answer for answer in answers)
-    assert last["error"] == "FaultError"
-    assert "no command for 50 ms" in last["message"]
-
-
 def test_emergency_stop_does_not_wait_for_a_servo_that_does_not_answer(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -265,13 +241,13 @@ def test_emergency_stop_does_not_wait_for_a_servo_that_does_not_answer(
     other."""
     log: list[tuple[str, int]] = []
     lines = {"one": attached("one", 1, 2, log=log), "two": attached("two", 3, log=log)}
-    monkeypatch.setitem(supervised_bus.BUSES, "dynamixel", lambda port, _: lines[port])
+    monkeypatch.setitem(emergency_stop.BUSES, "dynamixel", lambda port, _: lines[port])
     ports = {"one": [1, 2], "two": [3]}
     for line in lines.values():
         line.write_all("torque_enable", dict.fromkeys(line.ids, 1))
     log.clear()
     lines["one"].silent = {2}
-    said = emergency_stop(ports, models=[[54024, 54024], [54024]])
+    said = emergency_stop.switch_torque_off(ports, models=[[54024, 54024], [54024]])
     assert not any(servo.is_on for line in lines.values() for servo in line.servos.values())
     assert "not confirmed by servo 2 at one: switch the power off" in said
     assert "torque is off at two" in said
@@ -284,10 +260,10 @@ def test_emergency_stop_without_models_takes_those_that_answer(
 ) -> None:
     """Catches one servo without power that keeps all others under torque."""
     line = attached("one", 1, 2)
-    monkeypatch.setitem(supervised_bus.BUSES, "dynamixel", lambda *_: line)
+    monkeypatch.setitem(emergency_stop.BUSES, "dynamixel", lambda *_: line)
     line.write_all("torque_enable", {1: 1, 2: 1})
     line.silent = {1}
-    said = emergency_stop({"one": [1, 2]})
+    said = emergency_stop.switch_torque_off({"one": [1, 2]})
     assert not line.servos[2].is_on
     assert "servo 1 at one does not answer" in said
     assert said.endswith("torque of the others is off")

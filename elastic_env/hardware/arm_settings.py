@@ -23,7 +23,7 @@ ARM_LIMITS = SafetyLimits(
     hang_s=0.09,
     release_s=1.5,
 )
-"""Limits of arms, where a mounting says no others: their servos sag, and must not drop the arm."""
+"""Limits of arms where a mounting gives no others: their servos sag, and must not drop the arm."""
 
 
 class ServoPlace(Model):
@@ -36,7 +36,7 @@ class ServoPlace(Model):
     zero_rad: float = quantity("rad", 0.0, gt=-math.pi, lt=math.pi)
     """Servo angle where the joint of the model is at zero [rad]; 0 is the middle of a turn."""
     model: str | None = None
-    """Name of the servo, such as STS3215, which the bus must confirm; None for any."""
+    """Name of the servo, such as STS3215, checked at the start; None for any."""
 
 
 class ArmSettings(Model):
@@ -53,18 +53,18 @@ class ArmSettings(Model):
     rate_hz: float = quantity("Hz", 100.0, ge=50, le=200)
     """Control cycles per second [Hz]."""
     speed_rad_s: float = quantity("rad/s", 0.5, ge=0.01, le=2)
-    """Fastest motion of a joint on the way to a target [rad/s]."""
+    """Largest speed of a joint on the way to a target [rad/s]."""
     acceleration_rad_s2: float = quantity("rad/s²", 2.0, ge=0.01, le=20)
-    """Its fastest change [rad/s²]."""
+    """Largest acceleration on that way [rad/s²]."""
     confirm: bool = True
     """True if somebody at the terminal must agree before the first motion."""
     limits: SafetyLimits = ARM_LIMITS
-    """What stops a motion or limits the goal; each joint also keeps to the range of the model."""
+    """Limits of goals and measurements; each joint also keeps to its range in the model."""
 
     @field_validator("limits", mode="before")
     @classmethod
-    def _those_of_an_arm_unless_named(cls, given: Any) -> Any:
-        return {**ARM_LIMITS.model_dump(), **given} if isinstance(given, dict) else given
+    def _add_default_limits(cls, limits: Any) -> Any:
+        return {**ARM_LIMITS.model_dump(), **limits} if isinstance(limits, dict) else limits
 
     def _check(self) -> None:
         first: dict[int, str] = {}
@@ -77,27 +77,27 @@ class ArmSettings(Model):
             first[place.id] = name
 
     def servos(self, joints: Sequence[str]) -> "ServoMap":
-        """The servos of some joints, in their order.
+        """Servos of some joints, in the order of the joints.
 
         Raises:
-            ConfigurationError: A joint has none.
+            ConfigurationError: A joint has no servo.
         """
         for name in joints:
             if name not in self.joints:
                 raise ConfigurationError(
                     f"joint {name!r} has no servo: give its id under `joints` of the mounting, or"
-                    f" say {name}: held in the file of joints; there are ids of"
+                    f" write {name}: held in the file of joints; there are ids of"
                     f" {', '.join(self.joints)}"
                 )
         return ServoMap(tuple(joints), [self.joints[name] for name in joints])
 
 
 class ServoMap:
-    """Angles of joints and of their servos, both ways.
+    """Converts angles of joints to those of their servos, and back.
 
     Args:
         joints: Names of the joints, (n,).
-        places: Their servos.
+        places: Their servos, (n,).
     """
 
     def __init__(self, joints: tuple[str, ...], places: Sequence[ServoPlace]) -> None:
@@ -120,18 +120,14 @@ class ServoMap:
 
         Args:
             lowest: Lowest angles of the joints in the model, (n,) [rad].
-            highest: Highest ones.
+            highest: Highest angles, (n,) [rad].
             limits: Further limits of all joints.
 
         Raises:
             ConfigurationError: A joint has no range left within the servo's turn.
         """
-        ends = np.stack(
-            [
-                np.maximum(lowest, limits.lowest_rad),
-                np.minimum(highest, limits.highest_rad),
-            ]
-        )
+        lowest = np.maximum(lowest, limits.lowest_rad)
+        ends = np.stack([lowest, np.minimum(highest, limits.highest_rad)])
         ranges = np.sort(self.servo_angle(ends), axis=0).clip(-math.pi, math.pi)
         for joint in np.flatnonzero((ends[0] >= ends[1]) | (ranges[0] >= ranges[1])):
             low, high = ends[:, joint]

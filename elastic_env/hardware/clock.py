@@ -1,15 +1,15 @@
-"""The clock of buses, supervisors and control loops: the system's, or that of an emulated bus."""
+"""Clock of buses, supervisors and control loops: that of the system, or of an emulated bus."""
 
 from typing import Protocol
 
 
 class Clock(Protocol):
-    """What the module `time` offers of it."""
+    """A clock that only runs forwards, such as the module `time`."""
 
     def monotonic(self) -> float:
-        """Now [s]."""
+        """Present time [s]."""
         ...
 
     def sleep(self, seconds: float, /) -> None:
-        """Let time pass [s]."""
+        """Wait for a time [s]."""
         ...

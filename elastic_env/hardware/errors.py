@@ -1,4 +1,4 @@
-"""Errors of hardware. Every message names the port and says what to do."""
+"""Errors of hardware. Every message names the port and a cure."""
 
 from elastic_env.core.errors import SystemFailedError
 
@@ -8,19 +8,19 @@ class HardwareError(SystemFailedError):
 
 
 class PortError(HardwareError):
-    """A port cannot be opened, or another program has it."""
+    """A port cannot be opened, or another program uses it."""
 
 
 class ReplyError(HardwareError):
-    """A servo did not reply, or not with what was asked for."""
+    """A servo did not reply, or sent a wrong reply."""
 
 
 class BusGoneError(HardwareError):
     """The port is gone: unplugged, or its driver failed.
 
-    Nothing can be commanded any more, torque off neither.
+    No command reaches the servos any more, not even torque off.
     """
 
 
 class FaultError(HardwareError):
-    """Motion was stopped: torque is off, or the message says why that is not known."""
+    """The motion was stopped: torque is off, or the message says why that is uncertain."""

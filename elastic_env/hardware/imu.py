@@ -1,10 +1,10 @@
-"""The link's attitude from a MicroStrain IMU, read by a process of its own.
+"""Attitude of the link from a MicroStrain IMU, read by a separate process.
 
 A stream that stalls is an error.
 
-The maker's library keeps Python's lock while it waits, which would hold the control loop up, hence
-the process. The newest sample lies in shared memory with its time. A counter around each write, odd
-while it lasts, keeps halves of two samples apart.
+The maker's library holds Python's lock while it waits. This would delay the control loop, hence the
+process. The newest sample is in shared memory with its time. A counter is odd during each write, so
+that a reader never mixes two samples.
 """
 
 import math
@@ -13,7 +13,7 @@ import os
 import struct
 import subprocess
 import time
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import astuple, dataclass
 from typing import Any, Literal
 
@@ -37,12 +37,12 @@ _WAIT_S = 8.0
 
 
 class AttitudeError(HardwareError):
-    """The IMU cannot be opened, is silent, or sends angles that it cannot have measured."""
+    """The IMU cannot be opened, is silent, or sends implausible angles."""
 
 
 @dataclass(frozen=True)
 class Attitude:
-    """One sample: Euler angles [rad], north-east-down, and when it came in [s, monotonic]."""
+    """One sample: Euler angles [rad], north-east-down, and its time [s, monotonic clock]."""
 
     time_s: float
     roll: float
@@ -52,19 +52,19 @@ class Attitude:
     def link_angle(self, axis: Axis, sign: int, offset_rad: float) -> float:
         """Link angle sign · (Euler angle − offset) [rad], from −π to π.
 
-        The offset is that at q = 0.
+        The offset is the Euler angle at q = 0.
         """
         return math.remainder(sign * (getattr(self, axis) - offset_rad), 2.0 * math.pi)
 
 
 class PlausibleAttitudes:
-    """Looks at attitudes, one after the other, for those that cannot have been measured.
+    """Checks attitudes, one after the other, for values that cannot have been measured.
 
-    An IMU marks as valid what its filter has computed, right or not. A filter that stands still
-    goes on sending its last angles. Those of a working one should not be equal in all bits: a
-    gyroscope of some 0.005 °/s/√Hz turns an angle by about 10 µrad from packet to packet at 100 Hz,
-    and a bit is at most 0.24 µrad. So three angles that stay the same are no newer than when they
-    first came, and have the age at which any attitude counts as missing.
+    An IMU marks the result of its filter as valid, right or not. A filter that has stopped goes on
+    sending its last angles. Angles of a working filter should not be equal in all bits: a gyroscope
+    of some 0.005 °/s/√Hz changes an angle by about 10 µrad from packet to packet at 100 Hz, and a
+    bit is at most 0.24 µrad. So three equal angles are as old as their first packet, and count as
+    missing at the same age as any attitude.
 
     Args:
         oldest_s: Age at which an attitude counts as missing [s].
@@ -73,13 +73,13 @@ class PlausibleAttitudes:
     def __init__(self, oldest_s: float) -> None:
         self._oldest_s = oldest_s
         self._first: Attitude | None = None
-        """First sample with the angles of the last one."""
+        """First sample that has the angles of the last one."""
 
     def check(self, sample: Attitude) -> str:
-        """Take the newest sample.
+        """Check the newest sample.
 
         Returns:
-            What is wrong with it, and what to look at; "" if nothing.
+            The problem and its cure; "" if there is none.
         """
         for name, end in _RANGE_RAD.items():
             angle = getattr(sample, name)
@@ -114,7 +114,7 @@ class SharedSample:
 
     @staticmethod
     def file() -> int:
-        """New memory for a sample."""
+        """Create memory for a sample and return its file descriptor."""
         descriptor = os.memfd_create("attitude")
         os.ftruncate(descriptor, _SIZE)
         return descriptor
@@ -127,15 +127,14 @@ class SharedSample:
         _COUNTER.pack_into(self._memory, 0, counter + 2)
 
     def get(self) -> Attitude | None:
-        """The newest sample; None before the first.
+        """Newest sample; None before the first.
 
-        Where a write does not come to its end, because its process died or waits, it is the one
-        before.
+        If a write does not end, because its process died or waits, it is the sample before.
         """
         for _ in range(_TRIES):
             before = self._counter()
             values = _SAMPLE.unpack_from(self._memory, _COUNTER.size)
-            # packing a counter clears it first: a zero is none, once there was a sample
+            # packing a counter clears it first: a zero is no valid count
             if before and before % 2 == 0 and before == self._counter():
                 self._last = Attitude(*values)
                 break
@@ -154,18 +153,20 @@ class AttitudeStream(AbstractContextManager["AttitudeStream"]):
         oldest_s: Age at which a sample counts as missing [s].
 
     Raises:
-        PortError: There is no such port, it may not be opened, or another program has it.
-        AttitudeError: Nothing comes that is an attitude.
+        PortError: The port does not exist, cannot be opened, or another program uses it.
+        AttitudeError: No attitude comes.
     """
 
     def __init__(self, port: str, baudrate: int = 115200, oldest_s: float = 0.05) -> None:
         self.port = port
         self._oldest_s = oldest_s
         self._plausible = PlausibleAttitudes(oldest_s)
-        self._lock: int | None = lock_port(port)
+        self._resources = ExitStack()
+        self._resources.callback(os.close, lock_port(port))
         self._process: Process | None = None
         try:
             self._process = self._start(baudrate)
+            self._resources.callback(end_child, self._process, _END_S)
             deadline = time.monotonic() + _WAIT_S
             while self._shared.get() is None:
                 if self._process.poll() is not None or time.monotonic() > deadline:
@@ -176,11 +177,10 @@ class AttitudeStream(AbstractContextManager["AttitudeStream"]):
             raise
 
     def latest(self) -> Attitude:
-        """The newest sample.
+        """Newest sample.
 
         Raises:
-            AttitudeError: It is too old: the stream has stopped. Or no IMU that works can have
-                measured it.
+            AttitudeError: It is too old, because the stream has stopped, or it is implausible.
         """
         sample = self._shared.get()
         age_s = math.inf if sample is None else time.monotonic() - sample.time_s
@@ -192,23 +192,15 @@ class AttitudeStream(AbstractContextManager["AttitudeStream"]):
         return sample
 
     def close(self) -> None:
-        """End the reader, and give the port back; a second time does nothing."""
-        process = self._process
-        lock = self._lock
+        """End the reader and release the port; a second call does nothing."""
         self._process = None
-        self._lock = None
-        try:
-            if process is not None:
-                end_child(process, _END_S)
-        finally:
-            if lock is not None:
-                os.close(lock)
+        self._resources.close()
 
     def __exit__(self, *_: object) -> None:
         self.close()
 
     def _start(self, baudrate: int) -> Process:
-        """Start the reader, whose memory is mapped first."""
+        """Map the shared memory, then start the reader."""
         file = SharedSample.file()
         try:
             self._shared = SharedSample(file)
@@ -219,7 +211,7 @@ class AttitudeStream(AbstractContextManager["AttitudeStream"]):
             os.close(file)
 
     def _silence(self, last: Attitude | None = None) -> AttitudeError:
-        """The error of a stream that is silent, after a last sample or from the beginning."""
+        """Error of a stream that is silent after a last sample, or from the beginning."""
         process = self._process
         if process is None:
             return AttitudeError(f"the IMU at {self.port} is closed")

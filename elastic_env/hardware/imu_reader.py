@@ -1,4 +1,4 @@
-"""The process that reads the IMU by the maker's library, pymscl, whose module is called mscl."""
+"""Process that reads the IMU by the maker's library, pymscl, whose module is called mscl."""
 
 import os
 import select
@@ -12,20 +12,21 @@ from elastic_env.hardware.safety.realtime import Priority, prefer_realtime
 
 _CHANNELS = ("estRoll", "estPitch", "estYaw")
 _WAIT_MS = 20
-_STALE_AT_FIRST_S = 0.1
+_STALE_S = 0.1
+"""Time after the start in which samples may still come from the port's buffer [s]."""
 
 
 def read_attitudes(shared: SharedSample, port: str, baudrate: int) -> None:
-    """Put every valid attitude into shared memory until the input is closed.
+    """Write every valid attitude into shared memory until the input is closed.
 
-    What lay in the port's buffer before has no known age and is passed over. Damaged packets the
-    library drops itself.
+    Samples that were in the port's buffer before have no known age and are dropped. The library
+    itself drops damaged packets.
     """
     try:
         import mscl
     except ModuleNotFoundError:
         raise missing_extra("pymscl", "hardware", "reading the IMU") from None
-    # the library reads in a thread of its own
+    # the library reads in a thread
     prefer_realtime(Priority.IMU_READER, with_threads=True)
     connection = mscl.Connection.Serial(port, baudrate)
     node = mscl.InertialNode(connection)
@@ -33,13 +34,13 @@ def read_attitudes(shared: SharedSample, port: str, baudrate: int) -> None:
     while not select.select([sys.stdin], [], [], 0.0)[0]:
         for packet in node.getDataPackets(_WAIT_MS):
             sample = _attitude(packet)
-            if sample is not None and sample.time_s > begin + _STALE_AT_FIRST_S:
+            if sample is not None and sample.time_s > begin + _STALE_S:
                 shared.write(sample)
     connection.disconnect()
 
 
 def _attitude(packet: Any) -> Attitude | None:
-    """The attitude of a packet, None if it has none that is valid."""
+    """Attitude in a packet; None if it contains no valid one."""
     points = {point.channelName(): point for point in packet.data()}
     if not all(name in points and points[name].valid() for name in _CHANNELS):
         return None

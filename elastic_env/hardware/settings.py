@@ -9,7 +9,7 @@ from elastic_env.hardware.buses.packets import LARGEST_ID, RANGE_OF_RATES
 from elastic_env.hardware.buses.servo_models import LARGEST_TORQUE_NM
 
 PATIENT_LIMITS = {"patience_cycles": 10, "hang_s": 0.09}
-"""The most patient limits there are, for emulators: a busy computer delays pseudo-terminals."""
+"""Most patient limits, for emulators: a busy computer delays pseudo-terminals."""
 _TURN = 2.0 * math.pi
 _LEAST_RANGE_RAD = 0.01
 
@@ -17,7 +17,7 @@ _LEAST_RANGE_RAD = 0.01
 class SafetyLimits(Model):
     """Limits of commands, and of measurements that stop the motion.
 
-    Angles as the servo has them.
+    Angles are those of the servo.
     """
 
     lowest_rad: float = quantity("rad", -1.6, ge=-_TURN, le=_TURN)
@@ -25,41 +25,41 @@ class SafetyLimits(Model):
     highest_rad: float = quantity("rad", 1.6, ge=-_TURN, le=_TURN)
     """Highest goal [rad]."""
     margin_rad: float = quantity("rad", 0.05, ge=0, le=0.5)
-    """How far beyond that range a position may lie on the way; no motion begins there [rad]."""
+    """Margin beyond that range for positions on the way; no motion begins in it [rad]."""
     slew_rad_s: float = quantity("rad/s", 3.0, ge=0.01, le=10)
-    """Fastest change of the goal [rad/s]."""
+    """Largest rate of the goal [rad/s]."""
     speed_rad_s: float = quantity("rad/s", 4.5, ge=0.01, le=10)
     """Measured speed that stops the motion [rad/s]."""
     following_error_rad: float = quantity("rad", 0.35, ge=1e-3, le=1.5)
-    """Distance from the goal that stops the motion: something blocks [rad]."""
+    """Distance from the goal that stops the motion: the joint is blocked [rad]."""
     temperature_c: float = quantity("°C", 80.0, ge=1, le=80)
-    """Temperature that stops the motion, or the servo's own limit where that is lower [°C]."""
+    """Temperature that stops the motion, or the servo's own limit if that is lower [°C]."""
     torque_nm: float = quantity("N·m", LARGEST_TORQUE_NM, ge=0.1, le=LARGEST_TORQUE_NM)
-    """Torque, by the current, that stops the motion after `patience_cycles` [N·m]."""
+    """Torque, from the current, that stops the motion after `patience_cycles` [N·m]."""
     patience_cycles: int = quantity("1", 3, ge=1, le=10)
     """Cycles in a row without a usable reply, or with too much torque, that stop the motion [1]."""
     hang_s: float = quantity("s", 0.05, ge=0.005, le=0.09)
     """Time without a command, or an answer of the supervisor, that stops the motion [s]."""
     release_s: float = quantity("s", 0.0, ge=0, le=5)
-    """Time in which torque falls before it is off, on servos that can limit it [s]."""
+    """Time in which torque falls to zero, on servos that can limit it [s]."""
 
     def _check(self) -> None:
         if self.highest_rad - self.lowest_rad < _LEAST_RANGE_RAD:
-            needed = f"below highest_rad, by at least {_LEAST_RANGE_RAD} rad"
-            given = f"{self.lowest_rad} and {self.highest_rad}"
-            raise ValueError(f"lowest_rad must be {needed}, got {given}")
+            raise ValueError(
+                f"lowest_rad must be below highest_rad, by at least {_LEAST_RANGE_RAD} rad, got"
+                f" {self.lowest_rad} and {self.highest_rad}"
+            )
 
     def patience_hint(self, name: str) -> str:
-        """Words for an error that a more patient limit would have avoided.
+        """Hint in an error that a more patient limit would have avoided.
 
         Args:
-            name: The limit, one of `PATIENT_LIMITS`.
+            name: Name of the limit, one of `PATIENT_LIMITS`.
 
         Returns:
-            The option that raises it, "" where it is as patient as can be.
+            The option that raises the limit, "" if it is already the most patient one.
         """
-        is_most = getattr(self, name) >= PATIENT_LIMITS[name]
-        return "" if is_most else "; for an emulator: --patient"
+        return "" if getattr(self, name) >= PATIENT_LIMITS[name] else "; for an emulator: --patient"
 
 
 class HardwareSettings(Model):
@@ -79,7 +79,7 @@ class HardwareSettings(Model):
     zero_rad: float = quantity("rad", 0.0, gt=-math.pi, lt=math.pi)
     """Servo angle where the pendulum hangs [rad]."""
     imu_port: str | None = None
-    """Port of the IMU on the link; without one everything that needs the link angle is nan."""
+    """Port of the IMU on the link; without one all that needs the link angle is nan."""
     imu_baudrate: int = quantity("bit/s", 115_200, **RANGE_OF_RATES)
     """Rate of the IMU's port [bit/s]."""
     imu_oldest_s: float = quantity("s", 0.05, ge=0.01, le=1)
@@ -92,7 +92,7 @@ class HardwareSettings(Model):
     imu_sign: Literal[1, -1] = 1
     """Sign of the joint angle against that Euler angle."""
     imu_offset_rad: float = quantity("rad", 0.0, gt=-math.pi, lt=math.pi)
-    """Euler angle that it shows at q = 0 [rad]."""
+    """Euler angle at q = 0 [rad]."""
     largest_deflection_rad: float = quantity("rad", 0.2, ge=1e-3, le=1)
     """Angle between link, by the IMU, and servo that stops the motion [rad]."""
     approach_rad_s: float = quantity("rad/s", 0.2, ge=0.01, le=2)
@@ -100,20 +100,19 @@ class HardwareSettings(Model):
     confirm: bool = True
     """True if somebody at the terminal must agree before the first motion."""
     limits: SafetyLimits = SafetyLimits()
-    """What stops a motion, or limits the goal."""
+    """Limits of goals, and of measurements that stop the motion."""
 
     def _check(self) -> None:
-        named = (self.port, self.imu_port)
-        ports = [os.path.realpath(port) for port in named if port is not None]
-        if len(set(ports)) < len(ports):
+        imu_port = self.imu_port
+        if imu_port is not None and os.path.realpath(imu_port) == os.path.realpath(self.port):
             raise ValueError(f"servo and IMU need a port of their own, got {self.port} twice")
         low, high = self._servo_range()
         if low < -_TURN or high > _TURN:
-            lowest = self.limits.lowest_rad
-            highest = self.limits.highest_rad
+            limits = self.limits
             raise ValueError(
-                f"lowest_rad {lowest:g} and highest_rad {highest:g} with zero_rad {self.zero_rad:g}"
-                f" are {low:.2f} to {high:.2f} rad of the servo, which has ±{_TURN:.2f}"
+                f"lowest_rad {limits.lowest_rad:g} and highest_rad {limits.highest_rad:g} with"
+                f" zero_rad {self.zero_rad:g} are {low:.2f} to {high:.2f} rad of the servo, which"
+                f" has ±{_TURN:.2f}"
             )
 
     def servo_angle(self, joint: float) -> float:
@@ -126,10 +125,11 @@ class HardwareSettings(Model):
 
     @property
     def servo_limits(self) -> SafetyLimits:
-        """The limits in the servo's zero and sign."""
+        """Limits in the servo's zero and sign."""
         low, high = self._servo_range()
         return self.limits.replace(lowest_rad=low, highest_rad=high)
 
     def _servo_range(self) -> list[float]:
+        """Lowest and highest goal in the servo's zero and sign [rad]."""
         ends = (self.limits.lowest_rad, self.limits.highest_rad)
         return sorted(map(self.servo_angle, ends))

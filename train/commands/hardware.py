@@ -26,7 +26,8 @@ from elastic_env.hardware.safety.checks import Check as BusCheck
 from elastic_env.hardware.safety.checks import check_bus
 from elastic_env.hardware.settings import HardwareSettings
 from elastic_env.robots.testbed.environment import configure_testbed
-from train.commands.hardware_arm import KnownArm, OnArm, emulator_config
+from train.commands.hardware_arm import ArmOptions, ArmSetup
+from train.commands.hardware_arm_dry_run import emulator_config
 from train.commands.hardware_compensate import Compensate, LogPoses
 from train.commands.options import MotionOrDefault, OnHardware
 from train.evaluate.conditions import Condition, PolicySpec
@@ -34,7 +35,8 @@ from train.evaluate.rollout import ControlStep, control_steps, make_policy
 from train.runs.console import make_table
 from train.runs.folders import run_folder
 
-_SHOWN_S = 1.0
+_PRINT_PERIOD_S = 1.0
+"""Time of the episode between two lines on the console [s]."""
 
 
 class Scan(Model):
@@ -75,7 +77,7 @@ class Scan(Model):
 
 
 class Check(Model):
-    """Look at port, servos and IMU before anything moves, and say what to do.
+    """Check port, servos and IMU before anything moves, and list what to do.
 
     The exit code is 3 if there is anything to do.
 
@@ -91,9 +93,9 @@ class Check(Model):
     protocol: Protocol = "dynamixel"
     """Protocol of the servos."""
     imu_port: str | None = None
-    """Port of the IMU, another one than the servos'."""
+    """Port of the IMU, different from that of the servos."""
     imu_baudrate: int = 115_200
-    """Bits per second of the IMU's port; an IMU on USB has none."""
+    """Bits per second of the IMU's port; without effect for an IMU on USB."""
 
     def run(self, console: Console) -> None:
         """Check; nothing moves, nothing is written."""
@@ -108,17 +110,17 @@ class Check(Model):
             angles = ", ".join(f"{name} {getattr(sample, name):+.4f}" for name in names)
             checks.append(BusCheck("IMU", f"{angles} rad"))
         table = make_table(f"check of {self.port}", ["", "", "what to do"], [], left=3)
-        for one in checks:
-            cells = (one.what, one.value, "fine" if one.is_good else one.cure)
-            style = "" if one.is_good else "bold yellow"
+        for check in checks:
+            cells = (check.name, check.value, "fine" if check.is_good else check.cure)
+            style = "" if check.is_good else "bold yellow"
             table.add_row(*map(escape, cells), style=style)
         console.print(table)
-        if not all(one.is_good for one in checks):
+        if not all(check.is_good for check in checks):
             sys.exit(3)
 
 
 class Run(Model):
-    """Play one episode on the real testbed, show it as it goes, and keep every step.
+    """Play one episode on the real testbed, show it as it runs, and log every step.
 
     Example: elastic hardware run --port /dev/ttyUSB0 --imu-port /dev/ttyACM0 --policy input
         --reference sine
@@ -126,7 +128,7 @@ class Run(Model):
     """
 
     policy: str = "uncompensated"
-    """Baseline, residual:PATH, or "FILE.py:function" or "module:function" for one's own."""
+    """Baseline, residual:PATH, or "FILE.py:function" or "module:function" for your own."""
     reference: MotionOrDefault = None
     """Motion, as in elastic evaluate: sine takes 17 s, the default, hold, five minutes."""
     output: Path | None = None
@@ -136,28 +138,26 @@ class Run(Model):
     on: OnHardware = OnHardware()
 
     def run(self, console: Console) -> None:
-        """Play one episode and show it; log.csv keeps every step, also of one that is cut short."""
+        """Play one episode and show it; log.csv has every step, also if it is cut short."""
         if not (arguments := self.on.arguments):
             problem = "--port is needed; see: elastic hardware scan PORT, elastic hardware emulate"
             raise ConfigurationError(problem)
         spec = PolicySpec(name=self.policy)
-        played = Condition(env="hardware", policy=spec, reference=self.reference)
-        arguments = {"reference": played.reference, **arguments}
-        name = played.environment.id
-        env: Any = gymnasium.make(name, disable_env_checker=True, **arguments)
+        condition = Condition(env="hardware", policy=spec, reference=self.reference)
+        arguments = {"reference": condition.reference, **arguments}
+        env_id = condition.environment.id
+        env: Any = gymnasium.make(env_id, disable_env_checker=True, **arguments)
         recorded = {"policy": spec.model_dump(mode="json"), **arguments}
         with contextlib.closing(env):
             policy = make_policy(spec, env)
             with run_folder("hardware", recorded, None, self.output) as folder:
                 steps = control_steps(env, policy, None)
-                metrics = _keep_log(steps, folder / "log.csv", console)
-                text = json.dumps(metrics, indent=2)
-                (folder / "metrics.json").write_text(f"{text}\n")
-        files = "log.csv (every step), metrics.json, config.yaml"
-        console.print(f"Results in {folder}: {files}")
+                metrics = _log_steps(steps, folder / "log.csv", console)
+                (folder / "metrics.json").write_text(f"{json.dumps(metrics, indent=2)}\n")
+        console.print(f"Results in {folder}: log.csv (every step), metrics.json, config.yaml")
 
 
-_SHOWN = (
+_COLUMNS = (
     ("t", "s", "time_s", 1.0, "7.1f"),
     ("q_ref", "rad", "reference_angle", 1.0, "+8.4f"),
     ("link", "rad", "link_angle", 1.0, "+8.4f"),
@@ -170,11 +170,15 @@ _SHOWN = (
 """Columns on the console: title, unit, signal, factor and format."""
 
 
-def _keep_log(steps: Iterable[ControlStep], path: Path, console: Console) -> dict[str, Any]:
-    """Write every step, whatever ends the episode, and show a line once a second; the metrics."""
+def _log_steps(steps: Iterable[ControlStep], path: Path, console: Console) -> dict[str, Any]:
+    """Write every step, whatever ends the episode, and print a line once a second.
+
+    Returns:
+        Metrics of the episode.
+    """
     metrics: dict[str, Any] = {}
     rows = 0
-    next_s = _SHOWN_S
+    next_s = _PRINT_PERIOD_S
     with path.open("w", newline="") as file:
         log: Any = None
         try:
@@ -183,17 +187,17 @@ def _keep_log(steps: Iterable[ControlStep], path: Path, console: Console) -> dic
                 if not rows:
                     log = csv.DictWriter(file, list(row))
                     log.writeheader()
-                    widths = [len(format(0, form)) for *_, form in _SHOWN]
-                    for titles in list(zip(*_SHOWN, strict=True))[:2]:
+                    widths = [len(format(0, form)) for *_, form in _COLUMNS]
+                    for titles in list(zip(*_COLUMNS, strict=True))[:2]:
                         console.print("".join(map(str.rjust, titles, widths)))
                 log.writerow(row)
                 rows += 1
                 metrics = step.info.get("episode_metrics", metrics)
                 if row["time_s"] >= next_s:
-                    next_s += _SHOWN_S
+                    next_s += _PRINT_PERIOD_S
                     file.flush()
-                    shown = [format(row[key] * by, form) for *_, key, by, form in _SHOWN]
-                    console.print("".join(shown))
+                    cells = [format(row[key] * by, form) for *_, key, by, form in _COLUMNS]
+                    console.print("".join(cells))
         except BaseException:
             if rows:
                 console.print(f"cut short; the {rows} steps until then are in {path}")
@@ -206,15 +210,15 @@ def _keep_log(steps: Iterable[ControlStep], path: Path, console: Console) -> dic
 class Emulate(Model):
     """Emulate servos and an IMU on pseudo-terminals until Ctrl-C, to try all without hardware.
 
-    Behind them moves the simulated joint, in real time. Example, a bad cable: elastic hardware
-    emulate --lost 0.01
+    They move a simulated joint in real time. Example, a bad cable: elastic hardware emulate --lost
+    0.01
 
-    An arm behind them: elastic hardware emulate --robot docs/hardware/so101.xml --joints
+    A simulated arm: elastic hardware emulate --robot docs/hardware/so101.xml --joints
     docs/hardware/so101_joints.yaml --mounting docs/hardware/so101_mounting.yaml
     """
 
     robot: Locator | None = None
-    """Model of an arm behind the servos, MJCF or URDF; ids and servos are those of --mounting."""
+    """Model of an arm, MJCF or URDF, which the servos of --mounting move."""
     joints: Path | None = None
     """YAML file of its joints."""
     mounting: Path | None = None
@@ -224,7 +228,7 @@ class Emulate(Model):
     model_number: int = 54024
     """Type of the servos, as docs/hardware.md lists them, such as 54024 or 777."""
     baudrate: int | None = None
-    """Bits per second, no other rate is heard; default the usual rate of the protocol."""
+    """Bits per second; the servos hear no other rate. Default the usual rate of the protocol."""
     scenario: str = "nominal"
     """Scenario of the joint and of the IMU, as in elastic identify."""
     stiffness: float | None = None
@@ -232,8 +236,8 @@ class Emulate(Model):
     unheard: float = 0.0
     """Share of instructions that reach no servo."""
     lost: float = 0.0
-    """Share of replies that do not come; this and the next three are drawn for every reply, each
-    by itself.
+    """Share of replies that do not come; this and the next three are drawn independently for every
+    reply.
     """
     late: float = 0.0
     """Share of replies that come 6 ms late."""
@@ -247,17 +251,17 @@ class Emulate(Model):
     """Faults that begin later: overload, hot, silent, same_id, unplugged, imu_silent, imu_nan,
     imu_inf, imu_out_of_range, imu_frozen."""
     fault_after_s: float = quantity("s", 20.0, ge=0, le=86_400)
-    """When that happens, after the start [s]."""
+    """When these faults begin, after the start [s]."""
     seed: int = 0
     """Seed of noise and faults."""
 
     def run(self, console: Console) -> None:
         """Emulate until Ctrl-C."""
-        known = Faults.model_fields
-        switches = [name for name in known if known[name].annotation is bool]
+        fields = Faults.model_fields
+        switches = [name for name in fields if fields[name].annotation is bool]
         require_known("fault", self.fault, switches)
-        shares = self.model_dump(include=set(known))
-        config = self._arm() or EmulatorConfig(
+        shares = self.model_dump(include=set(fields))
+        config = self._arm_emulator() or EmulatorConfig(
             ids=tuple(self.ids),
             model_number=self.model_number,
             baudrate=self.baudrate,
@@ -265,14 +269,13 @@ class Emulate(Model):
         )
         faults = Faults(**shares, latency_s=1e-3 * self.latency_ms)
         config = config.replace(faults=faults, seed=self.seed)
-        ends = contextlib.suppress(KeyboardInterrupt)
-        with RunningEmulator(config) as emulator, ends:
+        with RunningEmulator(config) as emulator, contextlib.suppress(KeyboardInterrupt):
             ids = " ".join(map(str, config.ids))
             console.print(f"servos {ids} at {emulator.port}")
             check = f"elastic hardware check {emulator.port} --ids {ids}"
-            model = servo_model(config.model_number)
-            if model.protocol != "dynamixel":
-                check += f" --protocol {model.protocol}"
+            protocol = servo_model(config.model_number).protocol
+            if protocol != "dynamixel":
+                check += f" --protocol {protocol}"
             console.print(f"for example: {check}")
             if config.arm is None:
                 console.print(f"IMU at {emulator.imu_port}")
@@ -291,14 +294,13 @@ class Emulate(Model):
                 console.print(f"from now on: {', '.join(self.fault)}")
             emulator.wait()
 
-    def _arm(self) -> EmulatorConfig | None:
-        """The emulated arm; None where no model of one is named.
+    def _arm_emulator(self) -> EmulatorConfig | None:
+        """Emulator of an arm; None if no file of one is given.
 
         Raises:
             ConfigurationError: A file is missing, or cannot be used.
         """
-        given = (self.robot, self.joints, self.mounting)
-        if given == (None, None, None):
+        if (self.robot, self.joints, self.mounting) == (None, None, None):
             return None
         if self.robot is None or self.joints is None or self.mounting is None:
             raise ConfigurationError("an emulated arm needs --robot, --joints and --mounting")
@@ -312,12 +314,12 @@ class Emulate(Model):
                 "an emulated arm has the joints of --joints and the servos of --mounting; leave out"
                 f" {list_names(unused)}"
             )
-        arm = OnArm(robot=self.robot, mounting=self.mounting, dry_run=True)
-        return emulator_config(KnownArm(arm, self.joints))
+        options = ArmOptions(robot=self.robot, mounting=self.mounting, dry_run=True)
+        return emulator_config(ArmSetup(options, self.joints))
 
 
 class Hardware(Model):
-    """Real servos, or an emulated bus: scan, check, compensate an arm, run the testbed, emulate."""
+    """Real servos or an emulated bus: scan, check, compensate an arm, run the testbed, emulate."""
 
     command: (
         Scan
@@ -329,5 +331,5 @@ class Hardware(Model):
     )
 
     def run(self, console: Console) -> None:
-        """Do what was asked for."""
+        """Run the chosen command."""
         self.command.run(console)

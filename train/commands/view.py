@@ -38,27 +38,27 @@ from train.evaluate.rollout import make_policy
 
 FIRST_FACTOR = 3.0
 LARGEST_FACTOR = 20.0
-"""Factors of the slider: the one at the start, and its end."""
+"""Factor of the slider at the start, and its largest one."""
 
 _FRAMES_PER_S = 50
 _PAUSE_S = 0.01
-_SHORT = "/tmp"
-"""Folder of a socket: its path has at most about 100 characters, and TMPDIR may be longer."""
+_SOCKET_FOLDER = "/tmp"
+"""Folder of the socket: its path may have about 100 characters, and TMPDIR may be longer."""
 _TITLE = "elastic view: reference, motor side, link side"
 _FACTOR = "deviations drawn x"
-_PLACE = (16.0, 40.0)
+_POSITION = (16.0, 40.0)
 _SIZE = (400.0, 130.0)
-"""Of the window of sliders [pixels]."""
+"""Position and size of the window of sliders [pixels]."""
 
 
 @dataclass(frozen=True)
 class Recording:
-    """An episode as it is drawn.
+    """An episode as frames of a robot.
 
     Attributes:
-        robot: What is drawn.
+        robot: Model of the robot.
         times_s: Time of every frame since the start [s], rising.
-        frames: Where the robot is.
+        frames: Poses of the robot.
     """
 
     robot: DisplayRobot
@@ -66,13 +66,13 @@ class Recording:
     frames: Sequence[Sides]
 
     def at(self, time_s: float) -> Sides:
-        """The last frame that is not later than a time, or the first one."""
+        """Last frame that is not later than a time, or the first one."""
         return self.frames[max(bisect.bisect_right(self.times_s, time_s) - 1, 0)]
 
 
 @dataclass
 class Playback:
-    """State of the page, which sliders set and the drawing reads: time [s], factor, pause."""
+    """State of the page, set by sliders and read by the drawing: time [s], factor, pause."""
 
     recording: Recording
     time_s: float = 0.0
@@ -81,7 +81,7 @@ class Playback:
     _last_s: float = field(default_factory=time.monotonic)
 
     def tick(self) -> None:
-        """Go on by the time that has passed, from the end back to the start."""
+        """Advance by the time that has passed; restart at the end."""
         now = time.monotonic()
         last = self._last_s
         self._last_s = now
@@ -91,11 +91,11 @@ class Playback:
 
 
 def record(condition: Condition, console: Console, max_s: float | None) -> Recording:
-    """Play an episode and keep what is drawn.
+    """Play an episode and record its frames.
 
     Args:
-        condition: What to play.
-        console: Where messages go.
+        condition: Conditions of the episode.
+        console: Gets the messages.
         max_s: Stop after this much simulated time [s].
 
     Raises:
@@ -114,15 +114,15 @@ def record(condition: Condition, console: Console, max_s: float | None) -> Recor
             cure = "see HasSides in elastic_env.rendering.side_by_side"
             raise ElasticError(f"{type(picture).__name__} has no sides: {cure}")
         policy = make_policy(condition.policy, env)
-        for step, now in episode(env, policy, condition, steps, console):
+        for step, info in episode(env, policy, condition, steps, console):
             if step % every == 0:
-                times_s.append(float(now["time_s"]))
-                frames.append(picture.sides(now))
+                times_s.append(float(info["time_s"]))
+                frames.append(picture.sides(info))
         return Recording(picture.display_robot(), times_s, frames)
 
 
 class _Poses(plugin.SimPlugin):
-    """Takes the place of the physics: poses the three robots."""
+    """Poses the three robots, instead of the physics."""
 
     def __init__(self, playback: Playback, scene: SideBySide) -> None:
         self._playback = playback
@@ -130,7 +130,7 @@ class _Poses(plugin.SimPlugin):
 
     @messages.handler
     def _on_load_model(self, _: messages.LoadModelEvent) -> bool:
-        """Keep the three robots: no file of a page, nor its button to reload, replaces them."""
+        """Keep the three robots: no file and no reload of a page replaces them."""
         return True
 
     @messages.handler
@@ -153,50 +153,49 @@ class _Sliders(plugin.ViewerPlugin):
     @messages.handler
     def _on_build_gui(self, _: messages.BuildGuiEvent) -> None:
         play = self._playback
-        imgui.SetNextWindowPos(imgui.Vec2(*_PLACE), imgui.Cond.Once)
+        imgui.SetNextWindowPos(imgui.Vec2(*_POSITION), imgui.Cond.Once)
         imgui.SetNextWindowSize(imgui.Vec2(*_SIZE), imgui.Cond.Once)
         if imgui.Begin(_TITLE):
             end_s = play.recording.times_s[-1]
-            most = LARGEST_FACTOR
-            _, play.factor = imgui.SliderFloat(_FACTOR, play.factor, 0.0, most)
+            _, play.factor = imgui.SliderFloat(_FACTOR, play.factor, 0.0, LARGEST_FACTOR)
             _, play.time_s = imgui.SliderFloat("time [s]", play.time_s, 0.0, end_s)
             _, play.paused = imgui.Checkbox("pause", play.paused)
         imgui.End()
 
 
 class _PrivateViewer(web_viewer.WebViewer):
-    """MuJoCo's web viewer at a socket of ours, in place of a public port; it takes no models.
+    """MuJoCo's web viewer at our socket, instead of a public port; it accepts no models.
 
     Args:
-        endpoint: To the side that poses the robots.
-        plugins: What the page shows.
-        listener: Where the viewer listens.
+        endpoint: Connection to the plugin that poses the robots.
+        plugins: Plugins of the page.
+        listener: Socket at which the viewer listens.
     """
 
     def __init__(self, endpoint: Any, plugins: Any, listener: socket.socket) -> None:
         self._listener = listener
         config = viewer_protocol.ViewerConfig(title=_TITLE, gfx="web", http_port=0)
-        # it prints an address that is not ours
+        # the viewer prints an address that is not ours
         with contextlib.redirect_stdout(io.StringIO()):
             super().__init__(config, endpoint, plugins=plugins)
 
     def _start_server(self) -> None:
-        self._http_sock.close()  # it was bound to every address, and has never listened
+        self._http_sock.close()  # bound to every address, but not listening
         self._http_sock = self._listener
         super()._start_server()
 
     def get_drop_file(self) -> str:
-        """No file is taken from the page."""
+        """Return no file: the page takes none."""
         return ""
 
 
 @dataclass(frozen=True)
 class Page:
-    """A recording that browsers can see.
+    """A page that shows a recording to browsers.
 
     Attributes:
-        handle: What runs the loop, by its `sync`.
-        access: Who may see it, and its address.
+        handle: Handle whose `sync` runs the loop.
+        access: Address of the page, and rules of access.
     """
 
     handle: viewer_handle.ViewerHandle
@@ -205,48 +204,48 @@ class Page:
 
 @contextlib.contextmanager
 def show(recording: Recording, host: str = LOOPBACK, port: int = 0) -> Iterator[Page]:
-    """Serve a recording to browsers, in threads of their own, as long as what is within runs.
+    """Serve a recording to browsers, in threads, while the block runs.
 
     Args:
-        recording: What is shown, again and again.
+        recording: Recording that is repeated.
         host: Address or name of this machine at which the page listens.
         port: Port of the page; 0 takes the first free one from 8080 on.
 
     Raises:
-        ConfigurationError: Host or port cannot be.
-        SystemFailedError: The port is taken.
+        ConfigurationError: Host or port are invalid.
+        SystemFailedError: The port is in use.
     """
     browsers = open_listener(host, port)
     access = Access(host, browsers.getsockname()[1])
     with (
         contextlib.closing(browsers),
-        tempfile.TemporaryDirectory(prefix="elastic_view_", dir=_SHORT) as folder,
+        tempfile.TemporaryDirectory(prefix="elastic_view_", dir=_SOCKET_FOLDER) as folder,
         _launch(recording, f"{folder}/viewer") as handle,
         contextlib.closing(Proxy(browsers, f"{folder}/viewer", access)),
     ):
         yield Page(handle, access)
 
 
-def _launch(recording: Recording, place: str) -> viewer_handle.ViewerHandle:
-    """Start the viewer in a thread; it listens on a Unix socket of a path."""
+def _launch(recording: Recording, path: str) -> viewer_handle.ViewerHandle:
+    """Start the viewer in a thread; it listens on a Unix socket at a path."""
     scene = SideBySide(recording.robot)
     playback = Playback(recording)
     window = app.App(app.Config(show_options=False, show_inspector=False))
     plugins = [window, _Poses(playback, scene), _Sliders(playback)]
-    of_viewer, of_robots = plugin.split_plugins(plugins)
+    viewer_plugins, sim_plugins = plugin.split_plugins(plugins)
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-    listener.bind(place)
+    listener.bind(path)
     listener.listen()
     begun = threading.Event()
 
     def run(endpoint: Any) -> None:
         try:
-            viewer = _PrivateViewer(endpoint, of_viewer, listener)
+            viewer = _PrivateViewer(endpoint, viewer_plugins, listener)
         finally:
             begun.set()
         viewer_protocol.run_viewer_loop(viewer)
 
-    handle = launch_thread.launch_thread(run, sim_plugins=of_robots)
+    handle = launch_thread.launch_thread(run, sim_plugins=sim_plugins)
     begun.wait()
     handle.set_model(scene.model, data=mujoco.MjData(scene.model))
     return handle
@@ -255,10 +254,10 @@ def _launch(recording: Recording, place: str) -> viewer_handle.ViewerHandle:
 class View(WatchedEpisode):
     """Look at one episode in the browser: reference, motor side and link side, side by side.
 
-    The episode is played first, then shown again and again by MuJoCo's web viewer until Ctrl-C.
-    Sliders set the time, and the factor by which deviations from the reference are enlarged. The
-    page is reached from this machine alone, at the address that is printed, with its token; from
-    elsewhere by: ssh -L 8080:127.0.0.1:8080 MACHINE
+    The episode is played first, then repeated by MuJoCo's web viewer until Ctrl-C. Sliders set the
+    time, and the factor by which deviations from the reference are enlarged. Only this machine
+    reaches the page, at the printed address with its token; from elsewhere: ssh -L
+    8080:127.0.0.1:8080 MACHINE
 
     Example, one joint: elastic view --policy input --reference sine
 
@@ -266,7 +265,7 @@ class View(WatchedEpisode):
     """
 
     host: str = LOOPBACK
-    """Address or name of this machine at which the page listens; 0.0.0.0 for all, then others
+    """Address or name of this machine at which the page listens; with 0.0.0.0, other machines
     reach it too.
     """
     port: int = quantity("1", 0, ge=0, le=65535)
@@ -274,7 +273,7 @@ class View(WatchedEpisode):
 
     def run(self, console: Console) -> None:
         """Play an episode, then show it until Ctrl-C."""
-        # what cannot be is said before the episode
+        # a wrong host or port must fail before the episode
         open_listener(self.host, self.port).close()
         condition = self.condition
         console.print(f"playing {self.policy} first")
@@ -282,10 +281,10 @@ class View(WatchedEpisode):
         with show(recording, self.host, self.port) as page:
             console.print(f"the page is at {page.access.address}", highlight=False)
             if not page.access.is_local:
-                what = "sees the page and moves its sliders; nothing on the way is encrypted"
-                console.print(f"who has this address {what}")
+                rights = "can see the page and move its sliders; the connection is not encrypted"
+                console.print(f"whoever has this address {rights}")
             console.print("Ctrl-C ends it")
-            # opens a tab of the browser, where there is a display
+            # opens a tab of the browser, if there is a display
             has_display = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
             if has_display or not sys.platform.startswith("linux"):
                 arguments = (page.access.address, 2)

@@ -1,13 +1,13 @@
-"""A reverse proxy before MuJoCo's web viewer, which lets in only who has the page's own address.
+"""A reverse proxy before MuJoCo's web viewer: it admits only browsers that have the page's address.
 
-The viewer listens on every address, checks no Origin, and takes any model that is dropped on its
-page. Here it listens on a Unix socket in a folder of this user's. The proxy listens on a port, and
+The viewer listens on every address, checks no Origin, and accepts any model that is dropped on its
+page. Here it listens on a Unix socket in a folder of this user. The proxy listens on a port, and
 refuses with 403
 
-* a request without the token, which the printed address carries and a cookie keeps;
-* a Host that is not the page's (DNS rebinding), and an Origin that is not the Host's (another web
+* a request without the token, which the printed address contains and a cookie keeps;
+* a Host other than the page's (DNS rebinding), and an Origin other than the Host (another web
   page);
-* uploads: every method but GET, and every WebSocket but the two that the page draws from.
+* uploads: every method except GET, and every WebSocket except the two that the page needs.
 """
 
 import asyncio
@@ -24,31 +24,31 @@ from dataclasses import dataclass, field
 from elastic_env.core.errors import ConfigurationError, SystemFailedError, quote
 
 LOOPBACK = "127.0.0.1"
-"""The address of a page unless somebody asks for another one."""
+"""Default address of a page."""
 
 _FIRST_PORTS = range(8080, 8100)
-_LARGEST_HEAD = 32768
-"""Of a request or a response [bytes]."""
-_HEAD_S = 10.0
-"""For a request to arrive [s]."""
+_MAX_HEAD = 32768
+"""Longest head of a request or a response [bytes]."""
+_HEAD_TIMEOUT_S = 10.0
+"""Time in which the head of a request must arrive [s]."""
 _TOKEN = "token="
 _CURE = "open the address that elastic view has printed"
 _UPLOAD = "/drop"
 _SOCKETS = ("/ui", "/state")
-_UPGRADED = "(?i)upgrade|connection|sec-websocket-(key|version|protocol|extensions)"
-"""Headers of a WebSocket's opening that the viewer gets."""
-_PRIVATE = (
+_UPGRADE_HEADERS = "(?i)upgrade|connection|sec-websocket-(key|version|protocol|extensions)"
+"""Headers that open a WebSocket, which the viewer gets."""
+_PRIVACY_HEADERS = (
     ("Cross-Origin-Resource-Policy", "same-origin"),
     ("Referrer-Policy", "no-referrer"),
     ("X-Content-Type-Options", "nosniff"),
     ("X-Frame-Options", "DENY"),
 )
 _HOST = re.compile(r"(?P<name>\[[0-9a-f:.]+\]|[^\[\]:@/\s]+)(:(?P<port>\d+))?")
-_CLOSED = (asyncio.IncompleteReadError, TimeoutError, OSError)
+_CONNECTION_ERRORS = (asyncio.IncompleteReadError, TimeoutError, OSError)
 
 
 class RefusedError(Exception):
-    """A request that the page does not answer; the text says why."""
+    """A request that the page refuses, with the reason as text."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class Head:
 
     Attributes:
         line: The first line.
-        headers: Names and values, in their order.
+        headers: Names and values, in order.
     """
 
     line: str
@@ -65,10 +65,10 @@ class Head:
 
     @staticmethod
     def parse(data: bytes) -> "Head":
-        """A head as it arrived, with the empty line at its end.
+        """Parse a received head, with the empty line at its end.
 
         Raises:
-            RefusedError: It is none.
+            RefusedError: A header is malformed.
         """
         line, *others = data.decode("latin-1").removesuffix("\r\n\r\n").split("\r\n")
         headers = []
@@ -84,19 +84,19 @@ class Head:
         return [value for other, value in self.headers if other.lower() == name.lower()]
 
     def encode(self) -> bytes:
-        """As it is sent."""
+        """Encode the head for sending."""
         lines = [self.line, *(f"{name}: {value}" for name, value in self.headers)]
         return "\r\n".join([*lines, "", ""]).encode("latin-1")
 
 
 @dataclass(frozen=True)
-class Asked:
-    """A request that was let in.
+class AdmittedRequest:
+    """A request that may pass.
 
     Attributes:
-        path: What it asks for, without the token.
-        is_socket: Whether it opens a WebSocket.
-        has_address: Whether it has the token in its address, as the first request of a page.
+        path: Requested path, without the token.
+        is_socket: True if it opens a WebSocket.
+        has_address: True if its address has the token, as in the first request of a page.
     """
 
     path: str
@@ -106,12 +106,12 @@ class Asked:
 
 @dataclass(frozen=True)
 class Access:
-    """Who may see a page.
+    """Address of a page, and rules of access to it.
 
     Attributes:
-        host: Where it listens, as it was asked for.
-        port: Its port.
-        token: What the address must carry.
+        host: Address or name at which the page listens, as given by the user.
+        port: Port of the page.
+        token: Secret that the address contains.
     """
 
     host: str
@@ -127,23 +127,23 @@ class Access:
 
     @property
     def cookie(self) -> str:
-        """Name of the cookie: browsers send cookies to all ports of a host."""
+        """Name of the cookie, with the port: browsers send cookies to all ports of a host."""
         return f"elastic_view_{self.port}"
 
     @property
     def is_local(self) -> bool:
-        """True if only programs of this machine reach the page."""
+        """True if only programs on this machine reach the page."""
         return _is_loopback(self.host)
 
     @property
     def _is_everywhere(self) -> bool:
         return self.host in ("", "0.0.0.0", "::")
 
-    def admit(self, request: Head) -> Asked:
-        """Read a request.
+    def admit(self, request: Head) -> AdmittedRequest:
+        """Check a request.
 
         Raises:
-            RefusedError: It is not for this page, or not from it.
+            RefusedError: It is not for this page, or comes from another one.
         """
         method, _, rest = request.line.partition(" ")
         target, _, version = rest.partition(" ")
@@ -160,28 +160,31 @@ class Access:
         is_socket = bool(request.values("Upgrade"))
         _require(path.rstrip("/").lower() != _UPLOAD, "this page takes no uploads")
         has_body = any(map(request.values, ("Content-Length", "Transfer-Encoding")))
-        is_download = method == "GET" and not has_body
-        _require(is_download, "this page only answers GET without a body")
-        is_known = not is_socket or path in _SOCKETS
-        _require(is_known, f"WebSockets are {', '.join(_SOCKETS)}")
+        _require(method == "GET" and not has_body, "this page only answers GET without a body")
+        _require(not is_socket or path in _SOCKETS, f"WebSockets are {', '.join(_SOCKETS)}")
         query = "&".join(others)
-        return Asked(f"{path}?{query}" if query else path, is_socket, has_address)
+        return AdmittedRequest(f"{path}?{query}" if query else path, is_socket, has_address)
 
     def _require_own_host(self, request: Head) -> None:
+        """Check that Host and Origin are those of the page.
+
+        Raises:
+            RefusedError: One of them is not.
+        """
         hosts = [host.lower() for host in request.values("Host")]
         origins = [origin.lower() for origin in request.values("Origin")]
         is_own = len(hosts) == 1 and self._is_own(hosts[0])
         _require(is_own, f"the Host is not this page's: {_CURE}")
-        is_here = origins in ([], [f"http://{hosts[0]}"])
-        _require(is_here, "the request comes from another page")
+        _require(origins in ([], [f"http://{hosts[0]}"]), "the request comes from another page")
 
     def _is_own(self, host: str) -> bool:
-        found = _HOST.fullmatch(host)
-        if found is None or int((found["port"] or "80")[:6]) != self.port:
+        """Return True if a Host is one of the names of the page, with its port."""
+        match = _HOST.fullmatch(host)
+        if match is None or int((match["port"] or "80")[:6]) != self.port:
             return False
-        name = found["name"].strip("[]")
+        name = match["name"].strip("[]")
         if self._is_everywhere and _is_address(name):
-            return True  # a foreign page cannot make its own name stand for an address that is none
+            return True  # DNS rebinding needs a name, and this is an address
         names = {self.host.lower()}
         if self.is_local or self._is_everywhere:
             names |= {"localhost", LOOPBACK, "::1"}
@@ -190,17 +193,19 @@ class Access:
         return name in names
 
     def _has_token(self, parts: Iterable[str], prefix: str) -> bool:
-        """True if one of some parts is the token behind a prefix."""
-        own = f"{prefix}{self.token}".encode()
-        return any(secrets.compare_digest(part.encode(), own) for part in parts)
+        """Return True if one of some parts is the prefix with the token."""
+        expected = f"{prefix}{self.token}".encode()
+        return any(secrets.compare_digest(part.encode(), expected) for part in parts)
 
 
-def _require(holds: bool, reason: str) -> None:
-    if not holds:
+def _require(condition: bool, reason: str) -> None:
+    """Refuse a request for a reason unless a condition holds."""
+    if not condition:
         raise RefusedError(reason)
 
 
 def _is_address(name: str) -> bool:
+    """Return True if a name is an IP address."""
     try:
         ipaddress.ip_address(name)
     except ValueError:
@@ -209,20 +214,21 @@ def _is_address(name: str) -> bool:
 
 
 def _is_loopback(host: str) -> bool:
+    """Return True if a host is this machine's loopback."""
     is_name = host.lower() == "localhost"
     return is_name or (_is_address(host) and ipaddress.ip_address(host).is_loopback)
 
 
 def open_listener(host: str = LOOPBACK, port: int = 0) -> socket.socket:
-    """A socket that listens for browsers.
+    """Open a socket that listens for browsers.
 
     Args:
-        host: Address or name of this machine; "0.0.0.0" or "::" for all of its addresses.
-        port: 0 takes the first free one from 8080 on.
+        host: Address or name of this machine; "0.0.0.0" or "::" for all its addresses.
+        port: Port of the socket; 0 takes the first free one from 8080 on.
 
     Raises:
-        ConfigurationError: The host cannot be.
-        SystemFailedError: The port is taken, or this machine has no such address.
+        ConfigurationError: The host is invalid.
+        SystemFailedError: The port is in use, or this machine does not have the address.
     """
     kind = {"type": socket.SOCK_STREAM, "flags": socket.AI_PASSIVE}
     try:
@@ -233,10 +239,10 @@ def open_listener(host: str = LOOPBACK, port: int = 0) -> socket.socket:
             f" {quote(host)}"
         ) from None
     problem = OSError()
-    both = host == "::"
-    for one in [port] if port else [*_FIRST_PORTS, 0]:
+    has_both = host == "::"
+    for candidate in [port] if port else [*_FIRST_PORTS, 0]:
         try:
-            return socket.create_server((host, one), family=family, dualstack_ipv6=both)
+            return socket.create_server((host, candidate), family=family, dualstack_ipv6=has_both)
         except OSError as error:
             problem = error
     raise SystemFailedError(
@@ -249,9 +255,9 @@ class Proxy:
     """Answers browsers in a thread, until it is closed.
 
     Args:
-        listener: Where browsers come in, see `open_listener`.
-        viewer: Path of the Unix socket at which the viewer answers.
-        access: Who is let in.
+        listener: Socket for browsers, see `open_listener`.
+        viewer: Path of the Unix socket of the viewer.
+        access: Rules of access.
     """
 
     def __init__(self, listener: socket.socket, viewer: str, access: Access) -> None:
@@ -263,101 +269,107 @@ class Proxy:
         self._thread.start()
 
     def close(self) -> None:
-        """Answer nobody any more."""
-        with contextlib.suppress(RuntimeError):  # it has ended
+        """Stop answering."""
+        with contextlib.suppress(RuntimeError):  # the loop has ended
             self._loop.call_soon_threadsafe(self._loop.stop)
         self._thread.join()
         self._listener.close()
 
     def _run(self) -> None:
-        place = {"sock": self._listener, "limit": _LARGEST_HEAD}
+        """Run the server in the thread."""
+        options = {"sock": self._listener, "limit": _MAX_HEAD}
         with asyncio.Runner(loop_factory=lambda: self._loop) as runner:
-            runner.run(asyncio.start_server(self._answer, **place))
+            runner.run(asyncio.start_server(self._answer, **options))
             self._loop.run_forever()
 
     async def _answer(self, reader: StreamReader, writer: StreamWriter) -> None:
-        """One connection, which is for one request."""
-        with contextlib.suppress(*_CLOSED):
+        """Answer a connection, which has one request."""
+        with contextlib.suppress(*_CONNECTION_ERRORS):
             try:
                 request = await _read_head(reader)
-                asked = self._access.admit(request)
+                admitted = self._access.admit(request)
             except RefusedError as error:
                 writer.write(_refusal(str(error)))
                 await writer.drain()
             else:
-                await self._pass_on(request, asked, reader, writer)
+                await self._forward(request, admitted, reader, writer)
         writer.close()
 
-    async def _pass_on(
-        self, request: Head, asked: Asked, reader: StreamReader, writer: StreamWriter
+    async def _forward(
+        self, request: Head, admitted: AdmittedRequest, reader: StreamReader, writer: StreamWriter
     ) -> None:
-        opened = asyncio.open_unix_connection(self._viewer, limit=_LARGEST_HEAD)
-        viewer, to_viewer = await opened
+        """Forward a request to the viewer and its answer to the browser, until one side closes."""
+        viewer, to_viewer = await asyncio.open_unix_connection(self._viewer, limit=_MAX_HEAD)
         try:
-            to_viewer.write(_for_viewer(request, asked).encode())
+            to_viewer.write(_viewer_head(request, admitted).encode())
             answer = Head.parse(await viewer.readuntil(b"\r\n\r\n"))
-            writer.write(self._for_browser(answer, asked).encode())
-            ways = [asyncio.ensure_future(_copy(viewer, writer))]
-            if asked.is_socket:
-                ways.append(asyncio.ensure_future(_copy(reader, to_viewer)))
+            writer.write(self._browser_head(answer, admitted).encode())
+            copies = [asyncio.ensure_future(_copy(viewer, writer))]
+            if admitted.is_socket:
+                copies.append(asyncio.ensure_future(_copy(reader, to_viewer)))
             try:
-                await asyncio.wait(ways, return_when=asyncio.FIRST_COMPLETED)
+                await asyncio.wait(copies, return_when=asyncio.FIRST_COMPLETED)
             finally:
-                for way in ways:
-                    way.cancel()
-                await asyncio.gather(*ways, return_exceptions=True)
+                for task in copies:
+                    task.cancel()
+                await asyncio.gather(*copies, return_exceptions=True)
         finally:
             to_viewer.close()
 
-    def _for_browser(self, answer: Head, asked: Asked) -> Head:
-        """An answer that no other page may read, and with the cookie where a page begins."""
-        headers = [own for own in answer.headers if not _opens_page(own[0])]
-        headers += _PRIVATE
-        if not asked.is_socket:
-            headers = [own for own in headers if own[0].lower() != "connection"]
+    def _browser_head(self, answer: Head, admitted: AdmittedRequest) -> Head:
+        """Head of an answer that no other page may read; the first one sets the cookie."""
+        headers = [header for header in answer.headers if not _is_sharing(header[0])]
+        headers += _PRIVACY_HEADERS
+        if not admitted.is_socket:
+            headers = [header for header in headers if header[0].lower() != "connection"]
             headers.append(("Connection", "close"))
-        if asked.has_address:
-            kept = f"{self._access.cookie}={self._access.token}"
-            cookie = f"{kept}; Path=/; HttpOnly; SameSite=Strict"
-            headers.append(("Set-Cookie", cookie))
+        if admitted.has_address:
+            value = f"{self._access.cookie}={self._access.token}"
+            headers.append(("Set-Cookie", f"{value}; Path=/; HttpOnly; SameSite=Strict"))
         return Head(answer.line, headers)
 
 
 async def _read_head(reader: StreamReader) -> Head:
+    """Read the head of a request.
+
+    Raises:
+        RefusedError: It is too long or malformed.
+    """
     try:
-        async with asyncio.timeout(_HEAD_S):
+        async with asyncio.timeout(_HEAD_TIMEOUT_S):
             return Head.parse(await reader.readuntil(b"\r\n\r\n"))
     except asyncio.LimitOverrunError:
-        most = f"a request may have {_LARGEST_HEAD} bytes of headers"
-        raise RefusedError(most) from None
+        raise RefusedError(f"a request may have {_MAX_HEAD} bytes of headers") from None
 
 
-def _for_viewer(request: Head, asked: Asked) -> Head:
-    """A request as the viewer gets it: without token, cookies and Origin."""
+def _viewer_head(request: Head, admitted: AdmittedRequest) -> Head:
+    """Head of a request for the viewer: without token, cookies and Origin."""
     headers = [("Host", "viewer")]
-    if asked.is_socket:
-        headers += [own for own in request.headers if re.fullmatch(_UPGRADED, own[0])]
-    return Head(f"GET {asked.path} HTTP/1.1", headers)
+    if admitted.is_socket:
+        headers += [pair for pair in request.headers if re.fullmatch(_UPGRADE_HEADERS, pair[0])]
+    return Head(f"GET {admitted.path} HTTP/1.1", headers)
 
 
-def _opens_page(name: str) -> bool:
-    """True if a header of the viewer lets other pages read an answer."""
+def _is_sharing(name: str) -> bool:
+    """Return True if a header of the viewer lets other pages read an answer."""
     name = name.lower()
     return name.startswith("access-control-") or name == "cross-origin-resource-policy"
 
 
 def _refusal(reason: str) -> bytes:
+    """Answer to a refused request."""
     body = f"403: {reason}\n"
     headers = [
         ("Content-Type", "text/plain; charset=utf-8"),
         ("Content-Length", str(len(body.encode()))),
         ("Connection", "close"),
-        *_PRIVATE,
+        *_PRIVACY_HEADERS,
     ]
     return Head("HTTP/1.1 403 Forbidden", headers).encode() + body.encode()
 
 
 async def _copy(source: StreamReader, target: StreamWriter) -> None:
-    while data := await source.read(_LARGEST_HEAD):
+    """Copy bytes until the source ends."""
+    while data := await source.read(_MAX_HEAD):
         target.write(data)
         await target.drain()

@@ -18,7 +18,7 @@ _ARRAYS = ("position", "velocity", "torque", "is_fresh", "has_alert", "temperatu
 class States:
     """Replies of the servos in one cycle, (n,) each, in the order of their ids.
 
-    Where a servo's reply is missing its numbers are nan, never old ones.
+    The numbers of a servo without a reply are nan, never old ones.
     """
 
     position: Array
@@ -26,40 +26,39 @@ class States:
     velocity: Array
     """[rad/s]"""
     torque: Array
-    """Torque at the output, by the motor's current or load [N·m]; in motion only about it."""
+    """Torque at the output, from the motor's current or load [N·m]; in motion an approximation."""
     is_fresh: BoolArray
-    """True where the servo answered this very request, whole and intact."""
+    """True where an intact reply to this very request came."""
     has_alert: BoolArray
-    """True where it reports a hardware error."""
+    """True where the servo reports a hardware error."""
     time_s: float
-    """When the replies were in, on the monotonic clock."""
+    """Time at which all replies had come [s, monotonic clock]."""
     temperature: Array = field(default_factory=lambda: np.array(np.nan))
-    """[°C]; nan where this request was not for it, which nobody may take for cool.
+    """[°C]; nan where it was not requested, which does not mean cool.
 
-    One nan stands for all servos.
+    A single nan holds for all servos.
     """
 
     def dump(self) -> dict[str, Any]:
-        """The same as lists, for a message."""
+        """Fields as lists, for a message."""
         return {name: np.asarray(value).tolist() for name, value in vars(self).items()}
 
     @staticmethod
     def load(message: dict[str, Any]) -> "States":
-        """States from a message that holds `dump`."""
+        """States from a message with the fields of `dump`."""
         arrays = {name: np.array(message[name]) for name in _ARRAYS}
         return States(**arrays, time_s=float(message["time_s"]))
 
     @staticmethod
     def join(parts: Sequence["States"]) -> "States":
-        """The states of several buses; the time is that of the last reply."""
-        values = [vars(part) for part in parts]
-        arrays = {n: np.concatenate([own[n] for own in values]) for n in _ARRAYS}
+        """States of several buses as one; the time is that of the last reply."""
+        arrays = {n: np.concatenate([vars(part)[n] for part in parts]) for n in _ARRAYS}
         return States(**arrays, time_s=max(part.time_s for part in parts))
 
 
 @dataclass(frozen=True)
 class ServoInfo:
-    """A servo's answer to a ping."""
+    """Answer of a servo to a ping."""
 
     servo_id: int
     model_number: int
@@ -77,4 +76,4 @@ class Condition:
     temperature_limit: float
     """Highest temperature by the servo's own setting [°C]."""
     error: str
-    """The hardware error that it reports, "" if none."""
+    """Reported hardware error, "" if none."""

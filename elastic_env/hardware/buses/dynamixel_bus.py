@@ -4,12 +4,13 @@ from typing_extensions import override
 
 from elastic_env.hardware.buses import packets
 from elastic_env.hardware.buses.bus import ServoInfo
+from elastic_env.hardware.buses.packet_line import STRANGE, Status
 from elastic_env.hardware.buses.packets import Packet
-from elastic_env.hardware.buses.servo_bus import STRANGE, ServoBus, Status
+from elastic_env.hardware.buses.servo_bus import ServoBus
 
 
 class DynamixelBus(ServoBus):
-    """Dynamixel servos of Protocol 2.0 on a port, see `ServoBus`."""
+    """Dynamixel servos of Protocol 2.0 at a port."""
 
     protocol = "dynamixel"
     rates = packets.RATES

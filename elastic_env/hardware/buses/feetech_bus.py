@@ -4,17 +4,18 @@ from typing_extensions import override
 
 from elastic_env.hardware.buses import feetech_packets, packets
 from elastic_env.hardware.buses.bus import ServoInfo
+from elastic_env.hardware.buses.packet_line import Status
 from elastic_env.hardware.buses.packets import Packet
-from elastic_env.hardware.buses.servo_bus import ServoBus, Status
+from elastic_env.hardware.buses.servo_bus import ServoBus
 from elastic_env.hardware.buses.servo_models import servo_models
 
-_WHO = ("firmware_version", "model_number")
+_IDENTITY = ("firmware_version", "model_number")
 
 
 class FeetechBus(ServoBus):
-    """Feetech servos of the series STS and SMS on a port, see `ServoBus`.
+    """Feetech servos of the series STS and SMS at a port.
 
-    A status has no error of its own: it shows the bits of `hardware_error_status`.
+    A status contains no refusal, only the bits of `hardware_error_status`.
     """
 
     protocol = "feetech"
@@ -31,10 +32,10 @@ class FeetechBus(ServoBus):
 
     @override
     def _identify(self, servo_id: int, answer: bytes) -> ServoInfo:
-        known = [model for model in servo_models().values() if model.protocol == "feetech"]
-        first, last = (known[0].table[name] for name in _WHO)
-        place = self._place(first.address, last.end - first.address)
-        reply = self._request(servo_id, packets.READ, place, last.end - first.address)
+        table = next(m for m in servo_models().values() if m.protocol == "feetech").table
+        first, last = (table[name] for name in _IDENTITY)
+        length = last.end - first.address
+        reply = self._request(servo_id, packets.READ, self._place(first.address, length), length)
         return ServoInfo(servo_id, int.from_bytes(reply[-2:], "little"), reply[0])
 
     @override

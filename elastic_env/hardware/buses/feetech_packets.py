@@ -2,13 +2,14 @@
 
     FF FF  id  length  instruction or status  parameters ...  checksum
 
-The length counts what follows it. The checksum is the inverted sum of all between header and
-itself, modulo 256. Nothing is stuffed. Source: Feetech's protocol manual, and the packages
-scservo_sdk (feetech-servo-sdk) and FTServo_Python. The first is not kept: one version of 2022, a
-byte order that is global to the program, and a reply may take any time. So the frame is our own.
+The length counts the bytes after it. The checksum is the inverted sum of all bytes between header
+and checksum, modulo 256. There is no byte stuffing. Source: Feetech's protocol manual, and the
+packages scservo_sdk (feetech-servo-sdk) and FTServo_Python. We do not use the first package: it has
+one version of 2022, a global byte order, and no timeout of replies.
 
-Eight bits of checksum let one damaged packet of 256 pass whose faults are not of one bit. A header
-with the id and the length of a reply inside another one says that the first has lost its end.
+A checksum of eight bits lets one of 256 packets pass that are damaged in more than one bit. A
+header with the id and the length of a reply inside another reply means that the first one has lost
+its end.
 """
 
 from typing_extensions import override
@@ -28,7 +29,7 @@ def checksum(body: bytes) -> int:
 
 
 def packet(servo_id: int, instruction: int, parameters: bytes = b"") -> bytes:
-    """A packet as it goes over the wire; a reply has its status in place of the instruction."""
+    """Packet as bytes on the wire; a reply has its status instead of the instruction."""
     body = bytes([servo_id, len(parameters) + 2, instruction]) + parameters
     return HEADER + body + bytes([checksum(body)])
 
@@ -51,20 +52,20 @@ class Parser(packets.Parser):
                 del self._bytes[0]
                 continue
             raw = bytes(self._bytes[: 4 + length])
-            again = self._begin_inside(raw)
-            if again:
-                del self._bytes[:again]
+            inner = self._find_inner_packet(raw)
+            if inner:
+                del self._bytes[:inner]
                 return Packet(servo_id, raw[4], b"", is_intact=False)
             if len(raw) < 4 + length:
                 return None
             is_intact = checksum(raw[2:-1]) == raw[-1]
-            # of a damaged one the length may be wrong: look behind its header
+            # the length of a damaged packet may be wrong: search on behind its header
             del self._bytes[: len(raw) if is_intact else len(HEADER)]
             return Packet(servo_id, raw[4], raw[5:-1], is_intact)
 
     @staticmethod
-    def _begin_inside(raw: bytes) -> int:
-        """Where another packet of this length begins within; 0 if none does."""
+    def _find_inner_packet(raw: bytes) -> int:
+        """Position of another packet of the same length that begins inside; 0 if none does."""
         at = raw.find(HEADER, 2)
         while 0 < at < len(raw) - 3:
             if raw[at + 2] <= LARGEST_ID and raw[at + 3] == raw[3]:

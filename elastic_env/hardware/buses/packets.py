@@ -2,8 +2,8 @@
 
     FF FF FD 00  id  length (2)  instruction  parameters ...  CRC-16 (2)
 
-Within instruction and parameters FF FF FD is sent as FF FF FD FD, so that a header never occurs
-there; length and checksum count what is sent.
+In instruction and parameters FF FF FD is sent as FF FF FD FD, so that no header occurs there;
+length and checksum refer to the sent bytes.
 """
 
 from collections.abc import Sequence
@@ -23,7 +23,7 @@ SYNC_READ = 0x82
 SYNC_WRITE = 0x83
 
 ALERT = 0x80
-"""Bit of a status that says: read `hardware_error_status`."""
+"""Bit of a status that asks to read `hardware_error_status`."""
 
 RESULT_FAIL = 0x01
 INSTRUCTION_ERROR = 0x02
@@ -46,7 +46,7 @@ STATUS_ERRORS = {
 RATES = (3_000_000, 1_000_000, 57_600, 115_200, 2_000_000, 4_000_000)
 """Rates that servos, SDK and pseudo-terminals share, the likeliest first [bit/s]."""
 RANGE_OF_RATES = {"ge": 9_600, "le": 10_500_000}
-"""Bounds of servos and IMU, by their manuals [bit/s]."""
+"""Bounds of the rates of servos and IMU, by their manuals [bit/s]."""
 LONGEST_PACKET = 1024
 """Longest packet that a parser waits for [bytes]."""
 
@@ -58,7 +58,7 @@ def require_ids(ids: Sequence[int]) -> None:
     """Check the ids of the servos on a bus.
 
     Raises:
-        ConfigurationError: None are given, one of them twice, or one that no servo can have.
+        ConfigurationError: No id is given, one is given twice, or one is impossible.
     """
     are_ids = all(0 <= servo_id <= LARGEST_ID for servo_id in ids)
     if not ids or len(set(ids)) != len(ids) or not are_ids:
@@ -68,6 +68,7 @@ def require_ids(ids: Sequence[int]) -> None:
 
 
 def _crc_of_byte(byte: int) -> int:
+    """CRC-16 of one byte."""
     value = byte << 8
     for _ in range(8):
         value = (value << 1) ^ _POLYNOMIAL if value & 0x8000 else value << 1
@@ -78,41 +79,41 @@ _CRC_TABLE = [_crc_of_byte(byte) for byte in range(256)]
 
 
 def crc16(data: bytes, crc: int = 0) -> int:
-    """CRC-16 of polynomial 0x8005, from zero, not reflected."""
+    """CRC-16 with polynomial 0x8005, initial value zero, not reflected."""
     for byte in data:
         crc = ((crc << 8) & 0xFFFF) ^ _CRC_TABLE[(crc >> 8) ^ byte]
     return crc
 
 
 def explain_error(error: int) -> str:
-    """Words for the error number in a status."""
+    """Text for the error number in a status."""
     return STATUS_ERRORS.get(error, f"error {error}, which the protocol does not have")
 
 
 def stuff(body: bytes) -> bytes:
-    """Instruction and parameters as they are sent: FD stands behind every FF FF FD."""
+    """Add the byte FD after every FF FF FD of instruction and parameters."""
     return body.replace(_STUFFED, _STUFFED + b"\xfd")
 
 
 def unstuff(body: bytes) -> bytes:
-    """Instruction and parameters without the bytes that `stuff` added."""
+    """Remove the bytes that `stuff` added to instruction and parameters."""
     return body.replace(_STUFFED + b"\xfd", _STUFFED)
 
 
 def word(value: int) -> bytes:
-    """Two bytes, the low one first, as addresses and lengths are sent."""
+    """Encode an address or a length as two bytes, the low one first."""
     return value.to_bytes(2, "little")
 
 
 def packet(servo_id: int, instruction: int, parameters: bytes = b"") -> bytes:
-    """A packet as it goes over the wire."""
+    """Packet as bytes on the wire."""
     body = stuff(bytes([instruction]) + parameters)
     head = HEADER + bytes([servo_id]) + word(len(body) + 2) + body
     return head + word(crc16(head))
 
 
 def status(servo_id: int, error: int, parameters: bytes = b"") -> bytes:
-    """A servo's reply."""
+    """Reply of a servo as bytes on the wire."""
     return packet(servo_id, STATUS, bytes([error]) + parameters)
 
 
@@ -124,7 +125,7 @@ class Packet:
     instruction: int
     parameters: bytes
     is_intact: bool = True
-    """True if the checksum fits; of a packet that is not intact only the id is of use."""
+    """True if the checksum is right; otherwise only the id is usable."""
 
 
 class Parser:
@@ -134,7 +135,7 @@ class Parser:
         self._bytes = bytearray()
 
     def parse(self, data: bytes) -> list[Packet]:
-        """The packets that are complete with these bytes, in order."""
+        """Add received bytes and return the packets that are now complete, in order."""
         self._bytes += data
         return list(iter(self._next, None))
 
@@ -154,11 +155,11 @@ class Parser:
             raw = bytes(self._bytes[: 7 + length])
             is_whole = len(raw) == 7 + length
             is_intact = is_whole and word(crc16(raw[:-2])) == raw[-2:]
-            # in what is stuffed no header occurs, with the checksum behind it one may: only where
-            # the packet is not intact does a header before its end mean that the rest was lost
-            again = self._bytes.find(HEADER, len(HEADER))
-            if not is_intact and 0 < again < 7 + length:
-                del self._bytes[:again]
+            # stuffed bytes contain no header, but together with the checksum they may: a header
+            # before the end means a lost rest only if the packet is not intact
+            inner = self._bytes.find(HEADER, len(HEADER))
+            if not is_intact and 0 < inner < 7 + length:
+                del self._bytes[:inner]
                 continue
             if not is_whole:
                 return None

@@ -1,13 +1,13 @@
-"""Port of dynamixel-sdk, with the faults of version 4.1 mended.
+"""Port of dynamixel-sdk, with corrections of faults in version 4.1.
 
-Its packet handler is not used: it does not stuff what it sends, and unstuffs by bytes that it has
-already moved. `packets` does both.
+Its packet handler is not used: it does not stuff sent bytes, and unstuffs by bytes that it has
+already moved. `packets` does both correctly.
 
-| trap of dynamixel-sdk 4.1 | here |
+| fault of dynamixel-sdk 4.1 | here |
 |---|---|
 | every reply may take 34 ms before it counts as missing | `ServoBus.reply_timeout_s` |
 | waiting for a reply is a busy loop | `Port` blocks in the read |
-| each reply is read in two pieces | `Port.readPort` reads all that is there |
+| each reply is read in two pieces | `Port.readPort` reads all available bytes |
 | an unplugged port raises one of three errors | `bus_gone` makes one error of them |
 | two programs can open one port and speak at the same time | `Port` locks it, see `port_lock` |
 """
@@ -31,7 +31,7 @@ try:
     import serial
     from dynamixel_sdk.port_handler import PortHandler
 except ModuleNotFoundError as error:
-    # said where a port is opened: settings and help come without the extra
+    # raised only when a port is opened: settings and help need no extra
     _MISSING = missing_extra(str(error.name), "hardware", "a bus of servos")
     serial: Any = SimpleNamespace(SerialException=OSError)
     PortHandler: Any = object
@@ -39,15 +39,15 @@ else:
     _MISSING = None
 
 _READ_SLICE_S = 1e-3
-"""How long a read waits for its first byte [s]."""
+"""Longest wait of a read for its first byte [s]."""
 
 
 @contextmanager
 def bus_gone(port: str) -> Iterator[None]:
-    """Turn what a vanished port raises into one error.
+    """Turn the errors of a vanished port into one.
 
     Raises:
-        BusGoneError: The port failed within.
+        BusGoneError: The port failed in the block.
     """
     try:
         yield
@@ -60,14 +60,14 @@ def bus_gone(port: str) -> Iterator[None]:
 
 
 class Port(PortHandler):
-    """A serial port for one program alone.
+    """A serial port that only one program can use at a time.
 
     Args:
         name: Device, such as /dev/ttyUSB0.
         baudrate: Bits per second.
 
     Attributes:
-        clock: By which timeouts go; the system's, or that of an emulated line.
+        clock: Clock of timeouts: that of the system, or of an emulated line.
 
     Raises:
         MissingExtraError: The SDK is not installed.
@@ -85,7 +85,7 @@ class Port(PortHandler):
         """Open and lock the port.
 
         Raises:
-            PortError: It does not exist, may not be opened, or another program has it.
+            PortError: It does not exist, cannot be opened, or another program uses it.
         """
         name = self.port_name
         if self.getCFlagBaud(self.baudrate) < 0:
@@ -95,7 +95,7 @@ class Port(PortHandler):
         try:
             rate = self.baudrate
             self.use(serial.Serial(name, rate, timeout=_READ_SLICE_S, write_timeout=0.1))
-        except (OSError, termios.error) as error:  # of which SerialException is one
+        except (OSError, termios.error) as error:  # SerialException is an OSError
             self.closePort()
             raise cannot_open(name, error.args[0], _reason(error)) from None
         except BaseException:
@@ -103,21 +103,21 @@ class Port(PortHandler):
             raise
 
     def use(self, line: Any) -> None:
-        """Speak over a line that is open, as `serial.Serial` is."""
+        """Use an open line, such as a `serial.Serial`."""
         self.ser = line
         self.is_open = True
         self.tx_time_per_byte = 1e4 / self.baudrate
 
     def readPort(self, length: int) -> bytes:  # noqa: N802
-        """Bytes that have come, at most so many; waits a short while for the first one."""
+        """Read available bytes, at most `length`; wait a short while for the first one."""
         return self.ser.read(min(max(self.ser.in_waiting, 1), length))
 
     def getCurrentTime(self) -> float:  # noqa: N802
-        """Milliseconds of a clock that nobody sets."""
+        """Time of a monotonic clock [ms]."""
         return 1e3 * self.clock.monotonic()
 
     def closePort(self) -> None:  # noqa: N802
-        """Close; a second time, or without having been open, does nothing."""
+        """Close the port; do nothing if it is not open."""
         lock = self._lock
         self._lock = None
         try:
@@ -131,16 +131,13 @@ class Port(PortHandler):
 
     @property
     def latency_timer(self) -> Path:
-        """The file that holds the adapter's latency timer, if it has one."""
+        """File with the adapter's latency timer, if it has one."""
         device = Path(os.path.realpath(self.port_name)).name
         return Path("/sys/bus/usb-serial/devices") / device / "latency_timer"
 
     @property
     def latency_timer_ms(self) -> int | None:
-        """How long a USB adapter collects bytes before it passes them on [ms].
-
-        None where nobody says.
-        """
+        """Time that a USB adapter collects bytes before it passes them on [ms]; None if unknown."""
         try:
             return int(self.latency_timer.read_text())
         except (OSError, ValueError):
@@ -148,5 +145,5 @@ class Port(PortHandler):
 
 
 def _reason(error: Exception) -> str:
-    """The text of an error; termios gives a number before it."""
+    """Text of an error; termios puts a number before it."""
     return str(error.args[1]) if len(error.args) > 1 else str(error)

@@ -1,8 +1,8 @@
-"""One program per serial port: the lock that is taken before anything touches the line.
+"""Lock of a serial port for one program, taken before anything touches the line.
 
-It is an advisory lock (flock): programs that take none are not refused. The stronger mark TIOCEXCL
-would refuse them, but it outlives a program that is killed while any other has the port open, and
-then keeps out the one that is to switch torque off.
+It is an advisory lock (flock): it does not keep out programs that take none. The stronger TIOCEXCL
+would keep them out. But it outlives a killed program while another one has the port open, and then
+keeps out the process that must switch torque off.
 """
 
 import errno
@@ -14,17 +14,16 @@ from elastic_env.hardware.errors import PortError
 
 
 def lock_port(name: str) -> int:
-    """Take a serial port for this program alone, without changing its settings or reading from it.
+    """Lock a serial port for this program, without changing its settings or reading from it.
 
     Args:
         name: Device, such as /dev/ttyUSB0.
 
     Returns:
-        A descriptor; the port is given back when it is closed, and by the system when the program
-        ends.
+        A file descriptor; the lock ends when it is closed, or when the program ends.
 
     Raises:
-        PortError: There is no such port, it may not be opened, or another program has it.
+        PortError: The port does not exist, cannot be opened, or another program uses it.
     """
     try:
         descriptor = os.open(name, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
@@ -32,8 +31,7 @@ def lock_port(name: str) -> int:
         raise cannot_open(name, error.errno, str(error.strerror)) from None
     try:
         if not os.isatty(descriptor):
-            problem = f"it is no serial port; {_found_ports()}"
-            raise PortError(f"cannot open the port {name}: {problem}")
+            raise PortError(f"cannot open the port {name}: it is no serial port; {_found_ports()}")
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         os.close(descriptor)
@@ -45,7 +43,7 @@ def lock_port(name: str) -> int:
 
 
 def cannot_open(name: str, number: object, reason: str) -> PortError:
-    """The error, with its cure, of a port that the system does not open for a reason."""
+    """Error, with its cure, for a port that the system does not open."""
     if number == errno.EBUSY:
         return _port_in_use(name)
     if number == errno.EACCES:
@@ -60,6 +58,7 @@ def cannot_open(name: str, number: object, reason: str) -> PortError:
 
 
 def _port_in_use(name: str) -> PortError:
+    """Error for a port that another program uses."""
     return PortError(
         f"another program uses {name}; two on one bus would garble each other's packets. End that "
         f"program (fuser {name} says which it is), or name another port"
@@ -67,5 +66,6 @@ def _port_in_use(name: str) -> PortError:
 
 
 def _found_ports() -> str:
+    """Text with the USB serial adapters of this computer."""
     found = [*Path("/dev").glob("ttyUSB*"), *Path("/dev").glob("ttyACM*")]
     return f"found: {', '.join(sorted(map(str, found))) or 'no USB serial adapter'}"

@@ -1,4 +1,4 @@
-"""The bus of each protocol."""
+"""Classes of buses by protocol."""
 
 from elastic_env.hardware.buses.dynamixel_bus import DynamixelBus
 from elastic_env.hardware.buses.feetech_bus import FeetechBus
@@ -6,4 +6,4 @@ from elastic_env.hardware.buses.servo_bus import ServoBus
 from elastic_env.hardware.buses.servo_models import Protocol
 
 BUSES: dict[Protocol, type[ServoBus]] = {"dynamixel": DynamixelBus, "feetech": FeetechBus}
-"""Buses by the protocol that they speak."""
+"""Class of bus for each protocol."""

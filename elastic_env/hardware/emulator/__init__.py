@@ -1,1 +1,1 @@
-"""Servos and IMU without hardware: real protocols on pseudo-terminals, our own elastic joint."""
+"""Servos and IMU without hardware: real protocols on pseudo-terminals, simulated elastic joints."""

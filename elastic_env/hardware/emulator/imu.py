@@ -1,9 +1,8 @@
-"""The emulated MicroStrain IMU: attitudes of the link as packets of the MIP protocol.
+"""Emulated MicroStrain IMU: attitudes of the link as packets of the MIP protocol.
 
     75 65  set  length  [field length  field  data ...] ...  checksum (2)
 
-Numbers are big endian; the checksum is Fletcher's, both sums modulo 256 (as the maker's SDK has
-it).
+Numbers are big endian; the checksum is Fletcher's, both sums modulo 256, as in the maker's SDK.
 """
 
 import math
@@ -23,7 +22,7 @@ _EULER_ANGLES = 0x05
 _GPS_TIME = 0x11
 _VALID = 1
 _WOBBLE_RAD = 1e-5
-_NO_ANGLE = 8.0
+_IMPOSSIBLE_ANGLE = 8.0
 
 
 class EmulatedImu:
@@ -31,7 +30,7 @@ class EmulatedImu:
 
     Args:
         config: Rate, seed, and through the scenario of the testbed the quality.
-        start_s: The clock when it begins [s].
+        start_s: Time of the clock at the start [s].
     """
 
     def __init__(self, config: EmulatorConfig, start_s: float) -> None:
@@ -46,12 +45,12 @@ class EmulatedImu:
 
     @property
     def next_s(self) -> float:
-        """When it measures or sends next [s]."""
+        """Time of its next measurement or packet [s]."""
         due_s = self._packets[0][0] if self._packets else math.inf
         return min(self._measured_next_s, due_s)
 
     def measure(self, q: float, now: float, faults: Faults) -> None:
-        """Measure the link angle [rad] if that is due."""
+        """Measure the link angle [rad], if a measurement is due."""
         if now < self._measured_next_s:
             return
         self._measured_next_s = max(self._measured_next_s + self._period_s, now)
@@ -59,8 +58,8 @@ class EmulatedImu:
             return
         noise = self._generator.standard_normal(1)
         roll = attitude(self._quality, np.array([q]), np.zeros(1), noise)
-        # a real IMU should never send the same three angles twice; the roll is as good as the
-        # scenario says
+        # a real IMU should never send the same three angles twice; the quality of the roll is that
+        # of the scenario
         pitch, yaw = _WOBBLE_RAD * self._wobble.standard_normal(2)
         turn = math.remainder(float(roll[0]), 2.0 * math.pi)
         angles = (turn, float(pitch), float(yaw))
@@ -71,7 +70,7 @@ class EmulatedImu:
         self._packets.append((now + faults.imu_late_s, packet))
 
     def pop_due(self, now: float) -> bytes:
-        """Packets that are to be sent by now."""
+        """Remove and return the packets that are due."""
         due = b""
         while self._packets and self._packets[0][0] <= now:
             due += self._packets.popleft()[1]
@@ -79,18 +78,18 @@ class EmulatedImu:
 
 
 def distort(faults: Faults, angles: Angles, last: Angles) -> Angles:
-    """The angles that a faulty IMU sends.
+    """Angles that a faulty IMU sends.
 
     Args:
-        faults: What is wrong with it.
-        angles: Measured ones.
-        last: Those of the packet before.
+        faults: Faults of the IMU.
+        angles: Measured angles.
+        last: Angles in the previous packet.
     """
     if faults.imu_frozen:
         return last
     roll, pitch, yaw = angles
     if faults.imu_out_of_range:
-        roll = _NO_ANGLE
+        roll = _IMPOSSIBLE_ANGLE
     if faults.imu_inf:
         roll = math.inf
     if faults.imu_nan:
@@ -99,7 +98,7 @@ def distort(faults: Faults, angles: Angles, last: Angles) -> Angles:
 
 
 def checksum(data: bytes) -> bytes:
-    """Fletcher's checksum of everything before it."""
+    """Fletcher's checksum of bytes."""
     first = second = 0
     for byte in data:
         first = (first + byte) & 0xFF
@@ -108,7 +107,7 @@ def checksum(data: bytes) -> bytes:
 
 
 def attitude_packet(roll: float, pitch: float, yaw: float, time_s: float) -> bytes:
-    """Euler angles [rad] with the device's time [s]."""
+    """Packet with Euler angles [rad] and the device's time [s]."""
     fields = _field(_EULER_ANGLES, struct.pack(">fffH", roll, pitch, yaw, _VALID))
     fields += _field(_GPS_TIME, struct.pack(">dHH", time_s, 0, _VALID))
     packet = bytes([0x75, 0x65, _FILTER_SET, len(fields)]) + fields
@@ -116,4 +115,5 @@ def attitude_packet(roll: float, pitch: float, yaw: float, time_s: float) -> byt
 
 
 def _field(descriptor: int, data: bytes) -> bytes:
+    """Field of a packet, with its length and descriptor."""
     return bytes([len(data) + 2, descriptor]) + data

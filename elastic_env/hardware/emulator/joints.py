@@ -1,10 +1,11 @@
-"""The joints behind emulated servos, in real time: pendulums of the testbed, or an arm."""
+"""Simulated joints of emulated servos, in real time: pendulums of the testbed, or an arm."""
 
 from collections.abc import Sequence
 from typing import Any
 
 import mujoco
 import numpy as np
+from typing_extensions import override
 
 from elastic_env.core.config import Model
 from elastic_env.core.errors import ConfigurationError
@@ -24,14 +25,14 @@ class ServoJoints:
     """Joints that servos move, from rest.
 
     Args:
-        model: The elastic model.
-        joints: Their names in it, one for each servo.
-        servos: Their servos.
-        worlds: Number of worlds: 1 for an arm, else one for each servo, with its only joint.
-        start_s: The clock when they begin.
+        model: Elastic model.
+        joints: Names of the joints in it, one for each servo.
+        servos: Servos of the joints.
+        worlds: Number of worlds: 1 for an arm, else one for each servo, with a single joint.
+        start_s: Time of the clock at the start [s].
 
     Attributes:
-        skipped_s: Time that was left out because the emulator was not given the processor.
+        skipped_s: Time that was left out because the emulator did not get the processor [s].
     """
 
     def __init__(
@@ -46,8 +47,7 @@ class ServoJoints:
         self._simulation = simulate(model, worlds, num_threads=1)
         self._at = JointAddresses.of(model, joints)
         self._world: IntArray = np.arange(n) * int(worlds > 1)
-        actuators = [model.actuator(servo_name(name)).id for name in joints]
-        self._actuator = np.array(actuators)
+        self._actuator = np.array([model.actuator(servo_name(name)).id for name in joints])
         self._force = self._simulation.bind("actuator_force")
         self._range = self._simulation.vary("actuator_forcerange")
         self._torque_limits = [servo.torque_limit for servo in servos]
@@ -58,7 +58,7 @@ class ServoJoints:
             self.set_torque(index, 0.0)
 
     def advance(self, now_s: float) -> None:
-        """Let the joints move until the clock says now."""
+        """Simulate the joints up to a time of the clock [s]."""
         excess_s = self.lag(now_s) - _LARGEST_LAG_S
         if excess_s > 0.0:
             self.skipped_s += excess_s
@@ -69,25 +69,22 @@ class ServoJoints:
             self._clock_s += steps * self._timestep_s
 
     def motion(self, index: int) -> tuple[float, float, float]:
-        """Angle, its rate and the torque of a servo [rad], [rad/s], [N·m]."""
+        """Angle [rad], its rate [rad/s] and the torque [N·m] of a servo."""
         world = self._world[index]
         theta_dot = self._simulation.qvel[world, self._at.theta_dot[index]]
         torque = self._force[world, self._actuator[index]]
         return float(self.theta[index]), float(theta_dot), float(torque)
 
     def lag(self, now_s: float) -> float:
-        """How far the joints are behind the clock [s]."""
+        """Time by which the joints are behind the clock [s]."""
         return now_s - self._clock_s
 
     def command(self, index: int, angle: float) -> None:
-        """Goal of a servo [rad]."""
+        """Set the goal of a servo [rad]."""
         self._simulation.ctrl[self._world[index], self._actuator[index]] = angle
 
     def set_torque(self, index: int, share: float) -> None:
-        """Let a servo give a share of its torque, 0 to switch it off.
-
-        Its integrator begins without what it held before.
-        """
+        """Limit a servo to a share of its torque, 0 to switch it off, and reset its integrator."""
         limit = share * self._torque_limits[index]
         world = self._world[index]
         self._range[world, self._actuator[index]] = [-limit, limit]
@@ -104,6 +101,11 @@ class ServoJoints:
         return self._simulation.qpos[self._world, self._at.q]
 
     def _step(self, steps: int) -> None:
+        """Simulate some steps.
+
+        Raises:
+            ConfigurationError: The joints diverge.
+        """
         self._simulation.advance(steps)
         if not np.isfinite(self._simulation.qpos).all():
             raise ConfigurationError(
@@ -114,12 +116,12 @@ class ServoJoints:
 
 
 class Joints(ServoJoints):
-    """N pendulums on elastic joints, hanging at rest when they begin.
+    """N pendulums on elastic joints, which hang at rest at the start.
 
     Args:
-        config: Of the testbed: its true joint, true pendulum and physics step.
-        num_joints: How many.
-        start_s: The clock when they begin.
+        config: Configuration of the testbed: true joint, true pendulum and physics step.
+        num_joints: Number of joints.
+        start_s: Time of the clock at the start [s].
     """
 
     def __init__(self, config: TestbedConfig, num_joints: int, start_s: float) -> None:
@@ -127,21 +129,22 @@ class Joints(ServoJoints):
         if joint.servo is None:
             raise ConfigurationError("an emulated joint needs a servo, got None")
         if joint.servo.motor is not None:
-            problem = "an emulated servo controls its current, so that it has no motor"
-            cure = "leave `motor` of its servo out, or emulate an arm"
-            raise ConfigurationError(f"{problem}; {cure}")
+            raise ConfigurationError(
+                "an emulated servo controls its current, so that it has no motor; leave `motor` of"
+                " its servo out, or emulate an arm"
+            )
         spec = elastic_spec(config.true_pendulum, joint, config.form, config.timestep_s)
         n = num_joints
         super().__init__(spec.compile(), [JOINT] * n, [joint.servo] * n, n, start_s)
 
 
 class EmulatedArm(Model):
-    """An arm on emulated servos: its model and its joints, and how the servos sit in them."""
+    """An arm on emulated servos: model, joints, and mounting of the servos."""
 
     model: str
-    """File of MJCF or URDF, or the text of one."""
+    """File of MJCF or URDF, or the text of such a file."""
     joints: dict[str, Any]
-    """Settings of the elastic joints, as a file of joints has them."""
+    """Settings of the elastic joints, as in a file of joints."""
     order: tuple[str, ...]
     """Joints in the order of the servos' ids."""
     direction: tuple[int, ...]
@@ -149,23 +152,22 @@ class EmulatedArm(Model):
     zero_rad: tuple[float, ...]
     """Servo angle where the joint is at zero [rad]."""
     home: dict[str, float] = {}
-    """Where the arm lies until torque goes on for the first time, by joint [rad]."""
+    """Angles of the resting arm until torque goes on for the first time, by joint [rad]."""
 
     def _check(self) -> None:
         lengths = {len(self.order), len(self.direction), len(self.zero_rad)}
         if len(lengths) > 1:
-            lists = "order, direction and zero_rad"
-            raise ValueError(f"{lists} must be equally long, got {lengths}")
+            raise ValueError(f"order, direction and zero_rad must be equally long, got {lengths}")
 
 
 class ArmJoints(ServoJoints):
-    """An arm that lies where it is until torque goes on for the first time.
+    """An arm that rests until torque goes on for the first time.
 
-    Angles are those of the servos. A servo shows the torque that its duty cycle would give at rest.
+    Angles are those of the servos. A servo measures the torque of its duty cycle at rest.
 
     Args:
         arm: The arm.
-        start_s: The clock when it begins.
+        start_s: Time of the clock at the start [s].
 
     Raises:
         ConfigurationError: A joint is missing, or not elastic, or has no servo.
@@ -181,38 +183,38 @@ class ArmJoints(ServoJoints):
                     f"joint {name!r} cannot be emulated: it must be elastic and have a servo; the"
                     f" elastic joints are {', '.join(joints)}"
                 )
-        found = [joints[name].servo for name in arm.order]
-        servos = [servo for servo in found if servo is not None]
+        servos = [servo for name in arm.order if (servo := joints[name].servo) is not None]
         spec = config.robot.elastic(config)
         spec.option.timestep = _ARM_STEP_S
         spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-        self._is_lying = True
-        self._braking = [0.0 if one.motor is None else one.motor.damping for one in servos]
+        self._is_resting = True
+        motors = [servo.motor for servo in servos]
+        self._braking = [0.0 if motor is None else motor.damping for motor in motors]
         self._direction = np.array(arm.direction, dtype=np.float64)
         self._zero = np.array(arm.zero_rad)
         super().__init__(spec.compile(), arm.order, servos, 1, start_s)
-        places = dict(zip(config.robot.joints, config.robot.home or (), strict=False))
-        lying = [places.get(name, 0.0) for name in arm.order]
-        self._simulation.qpos[0, self._at.q] = lying
-        self._simulation.qpos[0, self._at.theta] = lying
+        angles = dict(zip(config.robot.joints, config.robot.home or (), strict=False))
+        rest = [angles.get(name, 0.0) for name in arm.order]
+        self._simulation.qpos[0, self._at.q] = rest
+        self._simulation.qpos[0, self._at.theta] = rest
 
+    @override
     def motion(self, index: int) -> tuple[float, float, float]:
-        """See `ServoJoints`."""
         theta, theta_dot, torque = super().motion(index)
         sign = float(self._direction[index])
         effort = sign * (torque + self._braking[index] * theta_dot)
         return sign * theta + float(self._zero[index]), sign * theta_dot, effort
 
+    @override
     def command(self, index: int, angle: float) -> None:
-        """See `ServoJoints`."""
-        turned = angle - self._zero[index]
-        super().command(index, float(self._direction[index] * turned))
+        super().command(index, float(self._direction[index] * (angle - self._zero[index])))
 
+    @override
     def set_torque(self, index: int, share: float) -> None:
-        """See `ServoJoints`."""
         super().set_torque(index, share)
-        self._is_lying &= share == 0.0
+        self._is_resting &= share == 0.0
 
+    @override
     def _step(self, steps: int) -> None:
-        if not self._is_lying:
+        if not self._is_resting:
             super()._step(steps)

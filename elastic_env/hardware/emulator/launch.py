@@ -1,4 +1,4 @@
-"""An emulator in a process of its own, as programs and tests start it, and its faults."""
+"""Start of an emulator in its own process, its configuration and its faults."""
 
 import json
 import os
@@ -23,9 +23,9 @@ _SHARE: dict[str, Any] = {"ge": 0, "le": 1}
 
 
 class Faults(Model):
-    """Faults of an emulated bus; all of them off by default.
+    """Faults of an emulated bus; all of them are off by default.
 
-    Shares are drawn per reply, or per instruction.
+    Shares are probabilities per reply, or per instruction.
     """
 
     unheard: float = quantity("1", 0.0, **_SHARE)
@@ -35,7 +35,7 @@ class Faults(Model):
     late: float = quantity("1", 0.0, **_SHARE)
     """Share of replies that come late [1]."""
     late_s: float = quantity("s", 0.006, ge=0, le=1)
-    """How late [s]."""
+    """Delay of late replies [s]."""
     corrupted: float = quantity("1", 0.0, **_SHARE)
     """Share of replies with a flipped bit [1]."""
     truncated: float = quantity("1", 0.0, **_SHARE)
@@ -43,11 +43,11 @@ class Faults(Model):
     latency_s: float = quantity("s", 0.0, ge=0, le=1)
     """Delay of every reply: the adapter's latency timer [s]."""
     overload: bool = False
-    """The servos report an overload and let go."""
+    """The servos report an overload and switch their torque off."""
     hot: bool = False
     """The servos are at 95 °C, and report no error."""
     silent: bool = False
-    """The servos hear but do not answer."""
+    """The servos obey but do not answer."""
     same_id: bool = False
     """A second servo answers with the first id, at the same time."""
     unplugged: bool = False
@@ -57,19 +57,19 @@ class Faults(Model):
     imu_late_s: float = quantity("s", 0.0, ge=0, le=1)
     """Delay of the IMU's packets [s]."""
     imu_nan: bool = False
-    """The IMU sends nan for the roll, as valid."""
+    """The IMU sends nan as a valid roll."""
     imu_inf: bool = False
-    """The IMU sends an infinite roll, as valid."""
+    """The IMU sends infinity as a valid roll."""
     imu_out_of_range: bool = False
-    """The IMU sends a roll that no angle has, as valid."""
+    """The IMU sends a number out of range as a valid roll."""
     imu_frozen: bool = False
-    """The IMU's packets go on, with the angles of the last one before."""
+    """The IMU goes on sending packets with the same angles."""
     imu_corrupted: float = quantity("1", 0.0, **_SHARE)
     """Share of IMU packets with a flipped bit [1]."""
 
 
 def damage(faults: Faults, reply: bytes, generator: Any) -> tuple[bytes, float]:
-    """A reply as the line delivers it: its bytes, none if it is lost, and its delay [s]."""
+    """Apply faults to a reply; return its bytes, none if it is lost, and its delay [s]."""
     delay = faults.latency_s
     chance = generator.random(4)
     if faults.silent or chance[0] < faults.lost:
@@ -84,7 +84,7 @@ def damage(faults: Faults, reply: bytes, generator: Any) -> tuple[bytes, float]:
 
 
 def flip_bit(data: bytes, generator: np.random.Generator) -> bytes:
-    """The same bytes with one bit inverted."""
+    """Bytes with one random bit inverted."""
     changed = bytearray(data)
     bit = int(generator.integers(8 * len(data)))
     changed[bit // 8] ^= 1 << bit % 8
@@ -103,15 +103,15 @@ class EmulatorConfig(Model):
     ids: tuple[int, ...] = (1,)
     """Their ids."""
     registers: dict[str, int] = {}
-    """Registers of all servos that differ from the factory's [count]."""
+    """Registers of all servos that differ from the factory settings [count]."""
     testbed: TestbedConfig = TestbedConfig()
-    """The joints behind them, and through its scenario the quality of the IMU."""
+    """Joints of the servos, and through its scenario the quality of the IMU."""
     arm: EmulatedArm | None = None
-    """An arm behind them, in the place of the testbed's joints."""
+    """Arm that the servos move, instead of the testbed's joints."""
     imu_rate_hz: float = quantity("Hz", 100.0, ge=1, le=1000)
     """Packets of the IMU per second [Hz]."""
     baudrate: int | None = quantity("bit/s", None, **packets.RANGE_OF_RATES)
-    """Rate of the bus, no other is heard; default the usual one of the protocol [bit/s]."""
+    """Rate of the bus; others are ignored. Default the usual one of the protocol [bit/s]."""
     faults: Faults = Faults()
     seed: int = quantity("1", 0, ge=0)
     """Seed of faults and noise [1]."""
@@ -121,8 +121,10 @@ class EmulatorConfig(Model):
         for name in self.registers:
             _ = model.table[name]
         if self.arm is not None and len(self.arm.order) != len(self.ids):
-            got = f"got {len(self.ids)} ids for {len(self.arm.order)} joints"
-            raise ValueError(f"an emulated arm needs one id for each of its joints, {got}")
+            raise ValueError(
+                f"an emulated arm needs one id for each of its joints, got {len(self.ids)} ids for"
+                f" {len(self.arm.order)} joints"
+            )
         if not hasattr(termios, f"B{self.rate}"):
             raise ValueError(
                 f"a pseudo-terminal has no rate of {self.rate} bit/s; it has {packets.RATES}"
@@ -139,11 +141,11 @@ class RunningEmulator(AbstractContextManager["RunningEmulator"]):
     """Starts an emulator; a context manager that ends it.
 
     Args:
-        config: What to emulate.
+        config: Configuration of the emulator.
 
     Attributes:
-        port: Of the servos.
-        imu_port: Of the IMU.
+        port: Port of the servos.
+        imu_port: Port of the IMU.
     """
 
     def __init__(self, config: EmulatorConfig | None = None) -> None:
@@ -155,32 +157,32 @@ class RunningEmulator(AbstractContextManager["RunningEmulator"]):
     def faults(self, **changes: Any) -> None:
         """Switch faults on and off, see `Faults`.
 
-        A bus that is plugged in again has another port.
+        A bus that is plugged in again gets another port.
         """
         self._take_ports(self._request({"faults": changes}))
 
     def events(self) -> list[tuple[float, int, str, int]]:
         """Switches, goals and requests for states since the last call.
 
-        Monotonic time, id, register, value [count]; `present_position` is what a state that was
-        asked for is to tell.
+        Each is monotonic time [s], id, register and value [count]; `present_position` stands for a
+        request of states, with the true position.
         """
         return [tuple(event) for event in self._request({"events": True})]
 
     def state(self) -> dict[str, Any]:
-        """Truth: time_s, theta and q [rad], torque_on, skipped_s."""
+        """True state: time_s, theta and q [rad], torque_on, skipped_s."""
         return self._request({"state": True})
 
     def wait(self) -> None:
         """Wait for an interrupt.
 
         Raises:
-            ElasticError: It has ended by itself.
+            ElasticError: The emulator has ended by itself.
         """
         self._receive()
 
     def close(self) -> None:
-        """End it."""
+        """End the emulator."""
         end_child(self._process, _END_S)
 
     def __exit__(self, *_: object) -> None:
@@ -188,7 +190,7 @@ class RunningEmulator(AbstractContextManager["RunningEmulator"]):
 
     def _request(self, request: dict[str, Any]) -> Any:
         assert self._process.stdin is not None
-        with suppress(BrokenPipeError):  # what it has said at its end tells why
+        with suppress(BrokenPipeError):  # the last answer gives the reason
             os.write(self._process.stdin.fileno(), json.dumps(request).encode() + b"\n")
         return self._receive()
 

@@ -1,4 +1,4 @@
-"""The emulator's own process: pseudo-terminals in real time, a channel for faults and events."""
+"""Process of the emulator: pseudo-terminals in real time, a channel for faults and events."""
 
 import contextlib
 import fcntl
@@ -28,22 +28,22 @@ from elastic_env.hardware.emulator.launch import EmulatorConfig, damage
 from elastic_env.hardware.emulator.servos import EmulatedBus, EmulatedServo
 from elastic_env.hardware.safety.realtime import Priority, prefer_realtime
 
-_PHYSICS_S = 2e-3  # between two advances, as a rule
-_LONGEST_PHYSICS_S = 5e-3  # and while replies go out
-_PACKET_BYTES = 62  # a USB adapter passes on as many bytes at once
-_PACKET_S = 1e-3  # or what it has after that time
+_PHYSICS_S = 2e-3  # usual time between two advances of the joints
+_LONGEST_PHYSICS_S = 5e-3  # longest time, while replies go out
+_PACKET_BYTES = 62  # a USB adapter passes on so many bytes at once
+_PACKET_S = 1e-3  # or the bytes that it has after this time
 _SETTLE_S = 3e-4  # after a write, for the kernel to pass it on at its lower priority
 _WAIT_S = 0.1
 _KEPT_EVENTS = 100_000
 _UNREAD_BYTES = 2000
-_OTHER = 0x11  # bits that the end of another servo's reply leaves
+_COLLISION_MASK = 0x11  # bits that remain where two servos reply at once
 _OUTPUT_SPEED = 5  # in what tcgetattr returns
 
 
 class Terminal:
-    """A pseudo-terminal that passes bytes through as they are.
+    """A pseudo-terminal that passes bytes through unchanged.
 
-    Programs open its name as they would a serial port.
+    Programs open its name like a serial port.
     """
 
     def __init__(self) -> None:
@@ -53,10 +53,7 @@ class Terminal:
         self.name = os.ttyname(self._slave)
 
     def write(self, data: bytes) -> None:
-        """Pass bytes on.
-
-        They are lost where nobody has read what is there, as on a line to nobody.
-        """
+        """Send bytes; those that no program reads are lost, as on a real line."""
         unread = fcntl.ioctl(self._slave, termios.FIONREAD, bytes(4))
         if int.from_bytes(unread, sys.byteorder) > _UNREAD_BYTES:
             termios.tcflush(self._slave, termios.TCIFLUSH)
@@ -64,21 +61,18 @@ class Terminal:
             os.write(self.master, data)
 
     def read_bytes(self) -> bytes:
-        """Bytes that have come."""
+        """Read received bytes."""
         with contextlib.suppress(OSError):
             return os.read(self.master, 4096)
         return b""
 
     def has_rate(self, baudrate: int) -> bool:
-        """True if the program at the other end has set a baud rate.
-
-        One that the system has no name for passes.
-        """
+        """Return True if the program at the other end has set this baud rate."""
         speed = termios.tcgetattr(self._slave)[_OUTPUT_SPEED]
         return speed == getattr(termios, f"B{baudrate}")
 
     def close(self) -> None:
-        """Take it away, as an unplugged adapter is."""
+        """Remove the terminal, as if its adapter were unplugged."""
         os.close(self.master)
         os.close(self._slave)
 
@@ -87,13 +81,13 @@ class Emulator:
     """Servos, joints and IMU behind two pseudo-terminals.
 
     Args:
-        config: What is emulated.
+        config: Configuration of the emulator.
         clock: Its clock; default the system's.
-        terminals: Makes what programs speak to.
+        terminals: Makes the terminals for programs.
 
     Attributes:
-        events: When, at which servo, which register became what: torque, goal and watchdog; and
-            which position was asked for.
+        events: Changes of torque, goal and watchdog, and requests of positions: time [s], id,
+            register and value [count].
     """
 
     def __init__(
@@ -111,20 +105,18 @@ class Emulator:
         self.events: deque[tuple[float, int, str, int]] = deque(maxlen=_KEPT_EVENTS)
         self.bus_terminal: Terminal | None = terminals()
         self.imu_terminal = terminals()
-        # each with a stream of its own: who asks for replies gets the same faults, whatever the
-        # time
+        # separate streams: the same requests meet the same faults, whatever their timing
         self._reply_faults = np.random.default_rng([config.seed, 0])
         self._instruction_faults = np.random.default_rng([config.seed, 2])
-        self._joints: ServoJoints
-        if config.arm is None:
-            self._joints = Joints(config.testbed, len(config.ids), now)
-        else:
-            self._joints = ArmJoints(config.arm, now)
+        arm = config.arm
+        self._joints: ServoJoints = (
+            ArmJoints(arm, now) if arm else Joints(config.testbed, len(config.ids), now)
+        )
         self._servos: list[EmulatedServo] = []
         for index, servo_id in enumerate(config.ids):
             motion = partial(self._joints.motion, index)
-            note = partial(self._note, index)
-            servo = EmulatedServo(servo_id, model, note, motion, config.registers)
+            notify = partial(self._apply_change, index)
+            servo = EmulatedServo(servo_id, model, notify, motion, config.registers)
             self._servos.append(servo)
         self._bus = EmulatedBus(self._servos)
         self._imu = EmulatedImu(config, now)
@@ -133,25 +125,25 @@ class Emulator:
         self._settled_s = now
 
     def step(self, wait_s: float, control: int) -> bool:
-        """Wait for something to happen, and let it.
+        """Wait for an event on bus or channel, or for a time [s], and process it.
 
         Returns:
-            True if the control channel has something to say.
+            True if a message waits in the control channel.
         """
         sources = [control]
         if self.bus_terminal is not None:
             sources.append(self.bus_terminal.master)
         ready, _, _ = select.select(sources, [], [], self._idle_s(wait_s))
         now = self._clock.monotonic()
-        self._send_due(now)  # replies wait for nothing
+        self._send_due(now)  # replies first
         is_idle = not self._replies and now >= self._settled_s
         for servo in self._servos:
             servo.watch(now)
-        has_heard = self.bus_terminal is not None and self.bus_terminal.master in ready
-        if has_heard:
-            now = self.hear()
+        has_instruction = self.bus_terminal is not None and self.bus_terminal.master in ready
+        if has_instruction:
+            now = self.answer_instructions()
         # after the answers, which are urgent
-        if has_heard or is_idle or self._joints.lag(now) > _LONGEST_PHYSICS_S:
+        if has_instruction or is_idle or self._joints.lag(now) > _LONGEST_PHYSICS_S:
             self._joints.advance(now)
         self._send_due(self._clock.monotonic())
         self._imu.measure(self._joints.q[0], now, self.faults)
@@ -161,7 +153,7 @@ class Emulator:
         return control in ready
 
     def pass_time(self) -> None:
-        """Let the joints move and replies go out until now."""
+        """Simulate the joints and send replies up to the present time."""
         now = self._clock.monotonic()
         self._joints.advance(now)
         self._send_due(now)
@@ -182,13 +174,13 @@ class Emulator:
 
     @property
     def ports(self) -> dict[str, str | None]:
-        """Names of the servos' port and of the IMU's."""
+        """Names of the ports of servos and IMU."""
         bus = None if self.bus_terminal is None else self.bus_terminal.name
         return {"port": bus, "imu_port": self.imu_terminal.name}
 
     @property
     def state(self) -> dict[str, Any]:
-        """Truth about joints and servos."""
+        """True state of joints and servos."""
         return {
             "time_s": self._clock.monotonic(),
             "theta": self._joints.theta.tolist(),
@@ -198,14 +190,14 @@ class Emulator:
         }
 
     def _idle_s(self, wait_s: float) -> float:
-        """How long nothing is to be done [s], at most a time."""
+        """Time until the next task [s], at most `wait_s`."""
         now = self._clock.monotonic()
         physics_s = self._settled_s if self._settled_s > now else now + _PHYSICS_S
         at = min(now + wait_s, physics_s, self._imu.next_s, self._next_packet_s())
         return max(at - now, 0.0)
 
     def _next_packet_s(self) -> float:
-        """When the adapter has enough replies to pass on, or has waited long enough."""
+        """Time at which the adapter has enough bytes to pass on, or has waited long enough [s]."""
         at = math.inf
         length = 0
         for due, reply in self._replies:
@@ -217,8 +209,8 @@ class Emulator:
                 break
         return at
 
-    def _note(self, index: int, servo_id: int, name: str, value: int) -> None:
-        """Pass a change of a servo on to its joint."""
+    def _apply_change(self, index: int, servo_id: int, name: str, value: int) -> None:
+        """Record a change of a servo's register, and apply it to the joint."""
         self.events.append((self._clock.monotonic(), servo_id, name, value))
         servo = self._servos[index]
         if name in ("torque_enable", servo.model.effort_register):
@@ -228,8 +220,8 @@ class Emulator:
         if name == "goal_position" and servo.is_on:
             self._joints.command(index, servo.goal)
 
-    def hear(self) -> float:
-        """Answer the instructions that have come; returns when they were read."""
+    def answer_instructions(self) -> float:
+        """Answer the received instructions; return the time at which they were read [s]."""
         terminal = self.bus_terminal
         data = b"" if terminal is None else terminal.read_bytes()
         now = self._clock.monotonic()
@@ -239,22 +231,23 @@ class Emulator:
             if self._instruction_faults.random() < self.faults.unheard:
                 continue
             for reply in self._bus.answer(packet, now):
-                self._queue(self._doubled(reply), now)
+                self._queue(self._collide(reply), now)
             if packet.instruction == packets.SYNC_READ:
                 name = "present_position"
                 for servo in self._servos:
                     self.events.append((now, servo.servo_id, name, servo[name]))
         return now
 
-    def _doubled(self, reply: bytes) -> bytes:
-        """A reply as the line has it, where low bits win, if two servos have the first id."""
+    def _collide(self, reply: bytes) -> bytes:
+        """Mix a reply with that of a second servo, if two have the first id; low bits win."""
         first = self._servos[0].servo_id
         at = {"dynamixel": 4, "feetech": 2}[self._servos[0].model.protocol]
         if not self.faults.same_id or reply[at] != first:
             return reply
-        return reply[:-4] + bytes(byte & _OTHER for byte in reply[-4:])
+        return reply[:-4] + bytes(byte & _COLLISION_MASK for byte in reply[-4:])
 
     def _queue(self, reply: bytes, now: float) -> None:
+        """Apply faults to a reply, and queue it until it is due."""
         data, delay_s = damage(self.faults, reply, self._reply_faults)
         wire_s = 10.0 * len(reply) / self.config.rate
         begin_s = max(now + delay_s, self._replies[-1][0] if self._replies else now)
@@ -262,6 +255,7 @@ class Emulator:
             self._replies.append((begin_s + wire_s, data))
 
     def _send_due(self, now: float) -> None:
+        """Send the replies that are due."""
         due = b""
         while self._replies and self._replies[0][0] <= now:
             due += self._replies.popleft()[1]
@@ -273,7 +267,7 @@ class Emulator:
 def serve(config: EmulatorConfig) -> None:
     """Emulate until the input ends.
 
-    Requests come as JSON lines, one each, and so do the answers.
+    Requests and answers are JSON objects, one per line.
     """
     emulator = Emulator(config)
     prefer_realtime(Priority.EMULATOR)
@@ -293,6 +287,7 @@ def serve(config: EmulatorConfig) -> None:
 
 
 def _answer(emulator: Emulator, request: dict[str, Any]) -> Any:
+    """Execute a request and return its answer."""
     if "faults" in request:
         emulator.set_faults(request["faults"])
         return emulator.ports

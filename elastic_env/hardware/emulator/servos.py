@@ -1,4 +1,4 @@
-"""Emulated servos and their bus: registers with their rules, and what they answer."""
+"""Emulated servos and their bus: registers with their rules, and answers to instructions."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -23,11 +23,11 @@ class EmulatedServo:
     """One servo on an emulated bus.
 
     Attributes:
-        servo_id: Its id.
-        model: Its type, by which its registers and units go.
+        servo_id: Id of the servo.
+        model: Type of the servo, with its registers and units.
         notify: Called with id, register and value when torque, goal or watchdog change.
-        motion: Gives what it measures: angle, its rate and torque [rad], [rad/s], [N·m].
-        registers: Values that differ from the factory's, by name [count].
+        motion: Returns the measured angle [rad], its rate [rad/s] and torque [N·m].
+        registers: Values that differ from the factory settings, by name [count].
     """
 
     servo_id: int
@@ -62,7 +62,7 @@ class EmulatedServo:
         return register.decode(self._memory[register.address : register.end])
 
     def __setitem__(self, name: str, value: int) -> None:
-        """Set a register [count], by no rules."""
+        """Set a register [count], without the rules of instructions."""
         register = self.model.table[name]
         self._memory[register.address : register.end] = register.encode(value)
 
@@ -83,7 +83,7 @@ class EmulatedServo:
         return self[name] / self[self.model.effort_maximum] if name else 1.0
 
     def measure(self) -> None:
-        """Put what it measures into its registers."""
+        """Write the measured motion into the registers."""
         position, velocity, torque = self.motion()
         self["present_position"] = self.model.count(position)
         self["present_velocity"] = round(velocity / self.model.velocity_unit)
@@ -91,19 +91,19 @@ class EmulatedServo:
         self[self.model.load_register] = round(load)
 
     def heat(self, is_hot: bool) -> None:
-        """Make it hot, which it shows as its temperature alone, or let it cool."""
+        """Make the servo hot or cool; only the temperature shows it."""
         self["present_temperature"] = _HOT_C if is_hot else _COOL_C
 
     def overload(self, is_overloaded: bool) -> None:
-        """Begin or end an overload: the status shows it, and the servo lets go."""
+        """Begin or end an overload: the status shows it, and torque goes off."""
         self["hardware_error_status"] = OVERLOAD if is_overloaded else 0
         if is_overloaded and self.is_on:
             self._change("torque_enable", 0)
 
     def watch(self, now_s: float) -> None:
-        """Stop where it is if the bus has been silent for longer than the watchdog allows.
+        """Stop at the present position if the bus has been silent longer than the watchdog allows.
 
-        Torque stays on, and no goal is taken before the watchdog is written to 0 (e-manual, Bus
+        Torque stays on, and goals are refused until 0 is written to the watchdog (e-manual, Bus
         Watchdog).
         """
         if not self.model.has_watchdog or self["bus_watchdog"] <= 0:
@@ -114,11 +114,11 @@ class EmulatedServo:
             self._change("bus_watchdog", _WATCHDOG_FIRED)
 
     def hear(self, now_s: float) -> None:
-        """Note that an instruction for anybody came over the bus."""
+        """Note an instruction on the bus, for any servo."""
         self._heard_s = now_s
 
     def answer(self, instruction: int, parameters: bytes) -> bytes:
-        """The reply to an instruction, as it goes over the wire."""
+        """Reply to an instruction, as bytes on the wire."""
         wire = WIRES[self.model.protocol]
         match instruction:
             case packets.PING:
@@ -134,16 +134,17 @@ class EmulatedServo:
                 return wire.status(self, packets.INSTRUCTION_ERROR | self._alert)
 
     def read_memory(self, address: int, length: int) -> tuple[int, bytes]:
-        """Error number and bytes; beyond the table there is nothing to read."""
+        """Error number and bytes; addresses beyond the table are refused."""
         if address + length > len(self._memory) or length == 0:
             return packets.ACCESS_ERROR | self._alert, b""
         self.measure()
         return self._alert, bytes(self._memory[address : address + length])
 
     def write_memory(self, address: int, data: bytes) -> int:
-        """Write whole registers from an address on.
+        """Write whole registers from an address on, all or none.
 
-        The error number, and then nothing is written.
+        Returns:
+            Error number; if it is one, nothing is written.
         """
         values: dict[str, int] = {}
         end = address + len(data)
@@ -168,7 +169,7 @@ class EmulatedServo:
         return self._alert
 
     def _refusal(self, register: Register, value: int) -> int:
-        """Error number of a value that the servo does not take, 0 if it does."""
+        """Error number of a value that the servo refuses, 0 if it accepts."""
         if (
             register.name.startswith("goal_")
             and self.model.has_watchdog
@@ -177,7 +178,7 @@ class EmulatedServo:
             return packets.RANGE_ERROR
         match register.name:
             case "goal_position" if self.model.protocol == "feetech":
-                return 0  # one beyond the limits is cut, see `_change`
+                return 0  # a goal beyond the limits is clipped, see `_change`
             case "goal_position":
                 lowest = self["min_position_limit"]
                 is_within = lowest <= value <= self["max_position_limit"]
@@ -191,10 +192,9 @@ class EmulatedServo:
                 return 0
 
     def _change(self, name: str, value: int) -> None:
-        """Store a value with all that follows from it.
+        """Store a value, and notify the joint.
 
-        A servo that gets torque keeps its goal, and runs to it: nobody says of the real ones that
-        they do not.
+        A servo that gets torque keeps its goal and moves to it: no manual excludes this.
         """
         if name == "goal_position" and self.model.protocol == "feetech":
             value = max(value, self["min_position_limit"])
@@ -210,13 +210,13 @@ class EmulatedServo:
 
 @dataclass(frozen=True)
 class Wire:
-    """How servos of a protocol speak.
+    """Differences between the protocols, as servos speak them.
 
     Attributes:
         word_bytes: Length of an address, and of a length, in an instruction.
-        parser: Of instructions.
-        status: A reply of a servo; its error is that of Protocol 2.0, with its alert bit.
-        is_talkative: Whether a ping tells the model, and damaged instructions are complained of.
+        parser: Parser of instructions.
+        status: Encodes a reply of a servo; its error is that of Protocol 2.0, with its alert bit.
+        is_talkative: True if a ping gives the model, and damaged instructions are answered.
     """
 
     word_bytes: int
@@ -237,7 +237,7 @@ def _dynamixel_status(servo: EmulatedServo, error: int, data: bytes = b"") -> by
 
 
 def _feetech_status(servo: EmulatedServo, _: int, data: bytes = b"") -> bytes:
-    """Nobody says how these servos refuse an instruction; here such a reply has no data."""
+    """Encode a reply; no manual says how these servos refuse, so a refusal has no data."""
     status = servo["hardware_error_status"]
     return feetech_packets.packet(servo.servo_id, status, data)
 
@@ -246,14 +246,14 @@ WIRES: dict[Protocol, Wire] = {
     "dynamixel": Wire(2, packets.Parser, _dynamixel_status, is_talkative=True),
     "feetech": Wire(1, feetech_packets.Parser, _feetech_status, is_talkative=False),
 }
-"""How servos speak, by protocol."""
+"""Differences between the protocols, by protocol."""
 
 
 class EmulatedBus:
-    """Hands instructions to its servos, and orders what they answer as the protocol says.
+    """Passes instructions to its servos, and orders their replies as the protocol requires.
 
     Args:
-        servos: In any order, of one protocol.
+        servos: Servos of one protocol, in any order.
     """
 
     def __init__(self, servos: Sequence[EmulatedServo]) -> None:
@@ -261,21 +261,21 @@ class EmulatedBus:
         self.wire = WIRES[servos[0].model.protocol]
 
     def answer(self, packet: Packet, now_s: float) -> list[bytes]:
-        """Replies to an instruction, each as it goes over the wire, in their order."""
+        """Replies to an instruction in their order, as bytes on the wire."""
         for servo in self.servos.values():
             servo.hear(now_s)
-        one = self.servos.get(packet.servo_id)
         if not packet.is_intact:
-            if one is None or not self.wire.is_talkative:
+            addressed = self.servos.get(packet.servo_id)
+            if addressed is None or not self.wire.is_talkative:
                 return []
-            return [self.wire.status(one, packets.CRC_ERROR)]
+            return [self.wire.status(addressed, packets.CRC_ERROR)]
         parameters = packet.parameters
         begin = 2 * self.wire.word_bytes
         match packet.instruction:
             case packets.SYNC_READ:
                 place = self.wire.place(parameters)
-                asked = [self.servos[i] for i in parameters[begin:] if i in self.servos]
-                return [self.wire.status(one, *one.read_memory(*place)) for one in asked]
+                chosen = [self.servos[i] for i in parameters[begin:] if i in self.servos]
+                return [self.wire.status(servo, *servo.read_memory(*place)) for servo in chosen]
             case packets.SYNC_WRITE:
                 address, length = self.wire.place(parameters)
                 for at in range(begin, len(parameters) - length, length + 1):
@@ -285,6 +285,6 @@ class EmulatedBus:
                 return []
         is_ping = packet.instruction == packets.PING
         is_to_all = is_ping and packet.servo_id == packets.BROADCAST
-        found = sorted(self.servos) if is_to_all else [packet.servo_id]
-        reached = [self.servos[i] for i in found if i in self.servos]
-        return [each.answer(packet.instruction, parameters) for each in reached]
+        ids = sorted(self.servos) if is_to_all else [packet.servo_id]
+        chosen = [self.servos[i] for i in ids if i in self.servos]
+        return [servo.answer(packet.instruction, parameters) for servo in chosen]

@@ -1,6 +1,7 @@
-"""An emulated bus, its driver and its supervisor in one process, on a clock that only they move.
+"""An emulated bus, its driver and its supervisor in one process, on a simulated clock.
 
-As from process to process, but without terminals, faster than in real time, and never too busy.
+They exchange the same bytes as separate processes, but without terminals and delays, and faster
+than real time.
 """
 
 import os
@@ -29,19 +30,19 @@ _NAME = "the emulated bus"
 
 
 class _Wire(Terminal):
-    """The emulator's end of a line."""
+    """Emulator's end of a line."""
 
     name = _NAME
     master = -1
 
     def __init__(self) -> None:
         self.sent = b""
-        """To the servos, not heard yet."""
-        self.shown = b""
-        """From them, not read yet."""
+        """Bytes to the servos that they have not read yet."""
+        self.received = b""
+        """Bytes from the servos that the driver has not read yet."""
 
     def write(self, data: bytes) -> None:
-        self.shown += data
+        self.received += data
 
     def read_bytes(self) -> bytes:
         data = self.sent
@@ -56,7 +57,7 @@ class _Wire(Terminal):
 
 
 class _Line:
-    """The driver's end, in the place of a `serial.Serial`: who asks for bytes lets time pass."""
+    """Driver's end of a line, instead of a `serial.Serial`; waiting for bytes lets time pass."""
 
     def __init__(self, emulator: Emulator, clock: "VirtualBus") -> None:
         self._emulator = emulator
@@ -70,39 +71,39 @@ class _Line:
 
     @property
     def in_waiting(self) -> int:
-        if not self._wire.shown:
+        if not self._wire.received:
             self._clock.sleep(_SLICE_S)
-        return len(self._wire.shown)
+        return len(self._wire.received)
 
     def write(self, data: bytes) -> int:
         self._wire.sent += bytes(data)
         self._clock.sleep(10.0 * len(data) / self._emulator.config.rate)
-        self._emulator.hear()
+        self._emulator.answer_instructions()
         return len(data)
 
     def read(self, length: int) -> bytes:
-        data = self._wire.shown[:length]
-        self._wire.shown = self._wire.shown[length:]
+        data = self._wire.received[:length]
+        self._wire.received = self._wire.received[length:]
         return data
 
     def reset_input_buffer(self) -> None:
-        self._wire.shown = b""
+        self._wire.received = b""
 
     def close(self) -> None:
         pass
 
 
 class VirtualBus(AbstractContextManager["VirtualBus"]):
-    """What a `SupervisedBus` offers, and the emulator behind it; also their clock.
+    """Emulated servos with the methods of a `SupervisedBus`; also their clock.
 
     Args:
-        config: What is emulated.
+        config: Configuration of the emulator.
 
     Attributes:
-        now_s: What it shows [s].
-        clock: Itself.
+        now_s: Time of the clock [s].
+        clock: The bus itself.
         emulator: Servos, joints and faults.
-        driver: Driver of the servos, which are attached.
+        driver: Driver with attached servos.
     """
 
     def __init__(self, config: EmulatorConfig) -> None:
@@ -114,8 +115,8 @@ class VirtualBus(AbstractContextManager["VirtualBus"]):
         self.driver.port.clock = self
         self.driver.port.use(_Line(self.emulator, self))
         self.driver.attach(config.ids)
-        nobody: Any = SimpleNamespace(send=lambda _: None)
-        self._supervisor = Supervisor(nobody, [self.driver], os.getpid())
+        channel: Any = SimpleNamespace(send=lambda _: None)
+        self._supervisor = Supervisor(channel, [self.driver], os.getpid())
 
     @property
     def links(self) -> Array:
@@ -123,11 +124,11 @@ class VirtualBus(AbstractContextManager["VirtualBus"]):
         return np.array(self.emulator.state["q"])
 
     def monotonic(self) -> float:
-        """Now [s]."""
+        """Time of the clock [s]."""
         return self.now_s
 
     def sleep(self, seconds: float, /) -> None:
-        """Let time pass: physics and replies."""
+        """Let a time pass [s], with physics and replies."""
         end_s = self.now_s + seconds
         while self.now_s < end_s:
             self.now_s = min(self.now_s + _SLICE_S, end_s)
@@ -135,33 +136,32 @@ class VirtualBus(AbstractContextManager["VirtualBus"]):
         sleep_until(self._ahead_s + self.now_s)
 
     def keep_pace(self) -> None:
-        """From now on let no time pass faster than it does, as somebody's targets come in it."""
+        """Run no faster than real time from now on, because a user sends targets in real time."""
         self._ahead_s = time.monotonic() - self.now_s
 
-    def enable(self, limits: SafetyLimits | None = None, ranges: Array | None = None) -> Array:
-        """See `SupervisedBus`."""
-        ends = None if ranges is None else ranges.tolist()
-        allowed = (limits or SafetyLimits()).model_dump()
-        return np.array(self._ask("enable", limits=allowed, ranges=ends)["position"])
+    def enable(self, limits: SafetyLimits, ranges: Array) -> Array:
+        """Switch torque on, see `SupervisedBus.enable`."""
+        answer = self._request("enable", limits=limits.model_dump(), ranges=ranges.tolist())
+        return np.array(answer["position"])
 
     def exchange(self, goals: Array, at: float) -> Cycle:
-        """See `SupervisedBus`."""
-        return Cycle.load(self._ask("exchange", goals=goals.tolist(), at=at))
+        """Run one control cycle, see `SupervisedBus.exchange`."""
+        return Cycle.load(self._request("exchange", goals=goals.tolist(), at=at))
 
     def keep(self, goals: Array, limit_s: float = 5.0) -> None:
-        """Nothing: no time passes until the next cycle."""
+        """Do nothing: no time passes until the next cycle."""
 
     def stop_keeping(self) -> None:
-        """Nothing, see `keep`."""
+        """Do nothing, as `keep`."""
 
     def close(self) -> None:
-        """Torque off."""
-        self._ask("disable")
+        """Switch torque off."""
+        self._request("disable")
 
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _ask(self, action: str, **arguments: Any) -> dict[str, Any]:
+    def _request(self, action: str, **arguments: Any) -> dict[str, Any]:
         answer = self._supervisor.answer({"do": action, "with": arguments})
         if "error" in answer:
             raise getattr(errors, answer["error"])(answer["message"])

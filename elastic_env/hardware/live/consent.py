@@ -1,4 +1,4 @@
-"""Somebody at the terminal, who sees whether the way of a motion is free."""
+"""Questions to the person at the terminal, who sees whether the robot may move."""
 
 import sys
 
@@ -6,14 +6,14 @@ from elastic_env.hardware.errors import HardwareError
 
 
 def require_consent(question: str, port: str) -> None:
-    """Ask at the terminal whether the way is free.
+    """Ask at the terminal whether the robot may move.
 
     Args:
-        question: What will happen.
-        port: For the messages.
+        question: Planned motion, and the question.
+        port: Port of the servos, for the messages.
 
     Raises:
-        HardwareError: Nobody is there, or agrees.
+        HardwareError: Nobody is at the terminal, or nobody agrees.
     """
     if not sys.stdin.isatty():
         problem = f"nobody is at the terminal to agree to a motion at {port}"
@@ -24,7 +24,7 @@ def require_consent(question: str, port: str) -> None:
 
 
 def answers_yes(question: str) -> bool:
-    """True if somebody at the terminal answers yes."""
+    """Return True if somebody at the terminal answers yes."""
     try:
         return input(question).strip().lower() == "yes"
     except EOFError:

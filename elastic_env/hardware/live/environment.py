@@ -1,8 +1,7 @@
-"""The registered environment on hardware, where measurements stand in the place of the truth.
+"""The registered environment on hardware: measurements replace the truth.
 
-The rules are those of `elastic_env/Testbed-v0`.
-
-What differs, because a real joint does not tell it:
+The rules are those of `elastic_env/Testbed-v0`. These signals differ, because a real joint gives
+only measurements:
 
 | signal | here |
 |---|---|
@@ -11,8 +10,8 @@ What differs, because a real joint does not tell it:
 | reward | its term `link_error` is by the IMU; nan without one |
 | `truth()`, and with it the policy `oracle` | an error |
 
-Beside the signals of the simulation stand `jitter` [s], `period` [s], `overruns`, `missed_replies`
-and `limited`, see `elastic_env.hardware.live.plant.CycleRecord`.
+There are further signals: `jitter` [s], `period` [s], `overruns`, `missed_replies` and `limited`,
+see `elastic_env.hardware.live.plant.CycleRecord`.
 """  # noqa: E501
 
 import inspect
@@ -56,7 +55,7 @@ class HardwareTestbedTask(JointTask):
     """Rules of `elastic_env/HardwareTestbed-v0`.
 
     Args:
-        config: Reference, assumed joint and pendulum; its scenario says nothing here.
+        config: Reference, assumed joint and pendulum; its scenario has no effect here.
         settings: Wiring, mounting and limits.
     """
 
@@ -83,7 +82,7 @@ class HardwareTestbedTask(JointTask):
             )
 
     def truth(self) -> JointTruth:
-        """There is none on hardware.
+        """Refuse: there is no truth on hardware.
 
         Raises:
             HardwareError: Always.
@@ -93,7 +92,7 @@ class HardwareTestbedTask(JointTask):
         )
 
     def _place(self, worlds: BoolArray) -> None:  # noqa: ARG002  there is one
-        """Drive the testbed to its start and let it settle under zero offset."""
+        """Move the testbed to its start and let it settle under zero offset."""
         self.plant.begin(float(self._reference.motion[0, 0, 0, 0]))
 
     def _begin_worlds(self, worlds: BoolArray) -> None:
@@ -101,7 +100,7 @@ class HardwareTestbedTask(JointTask):
         self._keep_cycle()
 
     def _sense_worlds(self, control: tuple[Any, ...]) -> bool:
-        """Behind the last step the pendulum is brought to rest."""
+        """Sense as in simulation; after the last step, bring the pendulum to rest."""
         is_over = super()._sense_worlds(control)
         self._keep_cycle()  # before the way back to rest, which measures too
         if is_over:
@@ -109,14 +108,14 @@ class HardwareTestbedTask(JointTask):
         return is_over
 
     def _signals(self, joints: Records, worlds: Records) -> Signals:
-        """Signals of a step, as in the table of the module."""
+        """Signals of a step, with those of its cycle."""
         cycle = worlds["cycle"]
-        own = {name: cycle[name].copy() for name in _CYCLE.names or ()}
-        return {**super()._signals(joints, worlds), **own}
+        timing = {name: cycle[name].copy() for name in _CYCLE.names or ()}
+        return {**super()._signals(joints, worlds), **timing}
 
     @property
     def _periods(self) -> float:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Several where a cycle had to be repeated."""
+        """Control periods in the last step; several if a cycle was repeated."""
         periods = self.plant.record.period / self.config.control_period_s
         return float(np.rint(max(periods, 1.0)))
 
@@ -125,44 +124,43 @@ class HardwareTestbedTask(JointTask):
 
 
 SCENARIO = "hardware"
-"""Name in the place of the scenario in tables of results."""
-_OF_A_SIMULATION = ("form", "timestep_s")
+"""Name that tables of results have instead of a scenario."""
+_SIMULATION_ONLY = ("form", "timestep_s")
 
 
 def configure_hardware(port: Any = None, **arguments: Any) -> HardwareTestbedTask:
-    """The task of `gymnasium.make("elastic_env/HardwareTestbed-v0", port=..., ...)`.
+    """Task of `gymnasium.make("elastic_env/HardwareTestbed-v0", port=..., ...)`.
 
     Args:
         port: Port of the servo.
-        **arguments: Those of `HardwareSettings`, and of `configure_testbed` of
-            `elastic_env.robots.testbed.environment` but for `form` and `timestep_s`; `scenario` can
+        **arguments: Arguments of `HardwareSettings`, and of `configure_testbed` of
+            `elastic_env.robots.testbed.environment` except `form` and `timestep_s`; `scenario` can
             only be "hardware" or "nominal", and changes nothing.
 
     Raises:
-        ConfigurationError: A name, a parameter or a combination that does not exist.
+        ConfigurationError: An argument is unknown, or a value or a combination is invalid.
     """
     if port is None:
         cure = "such as /dev/ttyUSB0; see: elastic hardware scan PORT"
         raise ConfigurationError(f"{ID} needs port, {cure}")
-    of_settings = list(HardwareSettings.model_fields)
+    settings_names = list(HardwareSettings.model_fields)
     parameters = inspect.signature(configure_testbed).parameters
-    of_testbed = [name for name in parameters if name not in _OF_A_SIMULATION]
-    require_known(f"argument of {ID}", arguments, [*of_settings, *of_testbed])
+    testbed_names = [name for name in parameters if name not in _SIMULATION_ONLY]
+    require_known(f"argument of {ID}", arguments, [*settings_names, *testbed_names])
     scenario = arguments.pop("scenario", SCENARIO)
     if scenario not in (SCENARIO, "nominal"):
         raise HardwareError(
-            f"a scenario is of a simulation; on hardware it is what it is, got {quote(scenario)}"
+            f"scenarios are for simulations; hardware has none, got {quote(scenario)}"
         )
-    settings = {name: arguments.pop(name) for name in of_settings if name in arguments}
+    settings = {name: arguments.pop(name) for name in settings_names if name in arguments}
     config = configure_testbed(scenario="ideal", **arguments)
     return HardwareTestbedTask(config, HardwareSettings(port=port, **settings))
 
 
 def make(render_mode: str | None = None, **arguments: Any) -> ElasticEnv:
-    """Entry point; arguments as in `configure_hardware`."""
+    """Make the environment; arguments as in `configure_hardware`."""
     task = configure_hardware(**arguments)
-    picture = partial(TestbedPicture, task.config.pendulum)
-    return ElasticEnv(task, render_mode, picture, task.plant)
+    return ElasticEnv(task, render_mode, partial(TestbedPicture, task.config.pendulum), task.plant)
 
 
 def make_vector(
@@ -172,7 +170,7 @@ def make_vector(
     render_mode: str | None = None,
     **arguments: Any,
 ) -> ElasticVectorEnv:
-    """Vector entry point, for the same programs to run on hardware: of one world.
+    """Make the vector environment, of one world, so that the same programs run on hardware.
 
     Raises:
         ConfigurationError: More than one world.

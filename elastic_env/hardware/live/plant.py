@@ -1,4 +1,4 @@
-"""Servo and IMU in the place of the physics: one control cycle is one advance of a `Simulation`."""
+"""Servo and IMU instead of the physics: one control cycle is one advance of a `Simulation`."""
 
 import math
 import sys
@@ -29,11 +29,11 @@ class CycleRecord(NamedTuple):
     """Torque and timing of the last control period; counts are of the episode."""
 
     joint_torque: float = np.nan
-    """By the motor current [N·m]."""
+    """Torque from the motor current [N·m]."""
     jitter: float = 0.0
-    """How late the reading was, or the command for it [s]."""
+    """Delay of the reading, or of its command [s]."""
     period: float = 0.0
-    """Time since the reading before [s]."""
+    """Time since the previous reading [s]."""
     overruns: int = 0
     """Periods that were more than half a period late, see `Pace`."""
     missed_replies: int = 0
@@ -43,14 +43,14 @@ class CycleRecord(NamedTuple):
 
 
 class ServoPlant:
-    """A servo on a bus, an IMU on its link; see `elastic_env.world.physics.Simulation`.
+    """A servo on a bus and an IMU on its link, used like `elastic_env.world.physics.Simulation`.
 
-    Nothing is opened before the first `begin`. A quantity that cannot be measured is nan: the
-    link's rate, and without an IMU its angle.
+    No port is opened before the first `begin`. Quantities without a measurement are nan: the link's
+    rate, and without an IMU its angle.
 
     Args:
-        model: The testbed's model, whose state vectors it fills.
-        at: Where motor and link angle stand in them.
+        model: Model of the testbed, which defines the state vectors.
+        at: Addresses of motor and link angle in them.
         settings: Wiring, mounting and limits.
         period_s: Control period [s].
         pendulum_nm: Torque of the pendulum at the horizontal, for the question before the first
@@ -86,7 +86,7 @@ class ServoPlant:
         self._is_kept = False
 
     def __getstate__(self) -> dict[str, object]:
-        """There is one joint at a port, and no copy of it.
+        """Refuse copies: there is one joint at a port.
 
         Raises:
             HardwareError: Always.
@@ -96,18 +96,18 @@ class ServoPlant:
         )
 
     def __del__(self) -> None:
-        """A testbed that nobody holds any more gives its ports back."""
+        """Release the ports of a testbed that is no longer used."""
         with suppress(Exception):
             self.close()
 
     def begin(self, angle: float) -> None:
-        """Torque on, slowly to an angle, and wait there.
+        """Switch torque on, move slowly to an angle, and wait there.
 
         Args:
-            angle: Of the joint's motor side [rad].
+            angle: Angle of the joint's motor side [rad].
 
         Raises:
-            HardwareError: Nobody agreed, or something of the hardware is not as it must be.
+            HardwareError: Nobody agreed, or servo, IMU or port fail.
         """
         if not self._is_agreed:
             limits = self.settings.limits
@@ -122,10 +122,9 @@ class ServoPlant:
         with self._closing_on_error():
             bus = self._open_bus()
             bus.disable()
-            stands = bus.enable(self.settings.servo_limits)
-            start = self.settings.joint_angle(float(stands[0]))
+            positions = bus.enable(self.settings.servo_limits)
             self._restart_clock()
-            self._move(start, angle)
+            self._move(self.settings.joint_angle(float(positions[0])), angle)
             for _ in range(round(_SETTLE_S / self._period_s)):
                 self._cycle(angle)
             self.record = CycleRecord(self.record.joint_torque)
@@ -136,8 +135,7 @@ class ServoPlant:
         """Command `ctrl`, wait for the end of the control period, read.
 
         Raises:
-            HardwareError: No episode is under way, or something of the hardware is not as it must
-                be.
+            HardwareError: No episode is under way, or servo, IMU or port fail.
         """
         if self._bus is None:
             raise HardwareError(
@@ -151,16 +149,16 @@ class ServoPlant:
             self._cycle(float(self.ctrl[0, 0]))
 
     def finish(self) -> None:
-        """Slowly back to where the pendulum hangs, then torque off and ports closed."""
+        """Move slowly back to the hanging pendulum, then switch torque off and close the ports."""
         try:
             self._move(self._goal, 0.0)
         finally:
             self.close()
 
     def close(self) -> None:
-        """Torque off; ports closed.
+        """Switch torque off and close the ports.
 
-        An error or an interrupt on whose way out this happens gets a note of it.
+        An error or an interrupt that is being handled gets a note that torque is off.
         """
         bus = self._bus
         imu = self._imu
@@ -179,17 +177,17 @@ class ServoPlant:
                 realtime.give_up_realtime()
 
     def restart(self, worlds: BoolArray) -> None:
-        """Nothing: an episode begins with `begin`."""
+        """Do nothing: an episode begins with `begin`."""
 
     def refresh(self, worlds: BoolArray) -> None:
-        """Nothing: hardware has nothing to compute."""
+        """Do nothing: hardware has nothing to compute."""
 
     def divergence(self) -> BoolArray:
-        """Hardware does not diverge: where something is wrong, an error says what."""
+        """Return False: hardware does not diverge; its faults are errors."""
         return np.zeros(1, dtype=np.bool_)
 
     def bind(self, field: object, *_: object) -> NoReturn:
-        """Hardware has no fields of MuJoCo, and no other model than the one it is.
+        """Refuse: hardware has no fields of MuJoCo.
 
         Raises:
             HardwareError: Always.
@@ -201,6 +199,7 @@ class ServoPlant:
     set_model: Any = bind
 
     def _open_bus(self) -> SupervisedBus:
+        """Return the bus; open servo and IMU if they are closed."""
         settings = self.settings
         if self._bus is None:
             ports = {settings.port: [settings.servo_id]}
@@ -213,7 +212,7 @@ class ServoPlant:
 
     @contextmanager
     def _closing_on_error(self) -> Iterator[None]:
-        """Torque off and ports closed where what is done within does not succeed."""
+        """Switch torque off and close the ports if the block fails."""
         try:
             yield
         except BaseException:
@@ -235,10 +234,7 @@ class ServoPlant:
         self._read_s = time.monotonic()
 
     def _cycle(self, angle: float) -> None:
-        """One control period.
-
-        Where the reply is missing the command is held and the cycle repeated.
-        """
+        """Run one control period; while a reply is missing, hold the command and repeat."""
         bus = self._open_bus()
         missed = self.record.missed_replies
         overruns = self.record.overruns
@@ -252,15 +248,15 @@ class ServoPlant:
             if cycle.states.is_fresh.all():
                 break
             missed += 1
-        self._read(cycle)
-        torque = float(cycle.states.torque[0])
+        self._store_measurements(cycle)
+        torque = self.settings.direction * float(cycle.states.torque[0])
         period_s = cycle.states.time_s - self._read_s
         timing = (late_s, period_s, overruns, missed, self.record.limited + is_limited)
-        self.record = CycleRecord(self.settings.direction * torque, *timing)
+        self.record = CycleRecord(torque, *timing)
         self._read_s = cycle.states.time_s
 
-    def _read(self, cycle: Cycle) -> None:
-        """Put the measurements of a cycle into the state vectors."""
+    def _store_measurements(self, cycle: Cycle) -> None:
+        """Write the measurements of a cycle into the state vectors."""
         settings = self.settings
         states = cycle.states
         at = self._at
@@ -271,17 +267,22 @@ class ServoPlant:
             sample = self._imu.latest()
             mounting = (settings.imu_axis, settings.imu_sign, settings.imu_offset_rad)
             q = sample.link_angle(*mounting)
-            self._require_together(q, states.time_s - sample.time_s)
+            self._require_small_deflection(q, states.time_s - sample.time_s)
             self.qpos[0, at.q[0]] = q
 
-    def _require_together(self, q: float, age_s: float) -> None:
-        """Refuse a link that is where no gear bends to.
+    def _require_small_deflection(self, q: float, age_s: float) -> None:
+        """Check that link and motor angle differ by no more than a gear can bend.
 
-        The motor has moved on since the IMU measured.
+        Args:
+            q: Link angle by the IMU [rad].
+            age_s: Time from its measurement to that of the motor, which has moved on [s].
+
+        Raises:
+            HardwareError: They differ by more.
         """
         settings = self.settings
         deflection = q - float(self.qpos[0, self._at.theta[0]])
-        # of others there is no remainder, and they are too far
+        # other values have no remainder, and exceed the limit anyway
         if math.isfinite(deflection):
             deflection = math.remainder(deflection, 2.0 * math.pi)
         moved = abs(float(self.qvel[0, self._at.theta_dot[0]])) * max(age_s, 0.0)
@@ -290,5 +291,5 @@ class ServoPlant:
                 f"the link, by the IMU at {settings.imu_port}, is {deflection:+.2f} rad from the "
                 "servo's angle, more than largest_deflection_rad "
                 f"{settings.largest_deflection_rad:g}: correct imu_sign, imu_axis and "
-                "imu_offset_rad of the mounting, or look what has come loose"
+                "imu_offset_rad of the mounting, or check what has come loose"
             )

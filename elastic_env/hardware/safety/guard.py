@@ -1,7 +1,7 @@
 """The last layer before the wire: limits commands, and stops a motion that leaves its limits.
 
-Whatever is not a finite number is beyond every bound. `nan > limit` is False, so that a plain
-comparison would let a motion go on whose measurement is none.
+A value that is not finite is beyond every bound. `nan > limit` is False, so a plain comparison
+would let a motion go on without a valid measurement.
 """
 
 from collections.abc import Sequence
@@ -16,34 +16,32 @@ from elastic_env.hardware.errors import FaultError
 from elastic_env.hardware.settings import SafetyLimits
 
 _START_SLACK_RAD = 0.005
-"""How far outside a motion may begin: weight presses a servo that rests on a stop beyond it. The
-first goal is within the limits [rad]."""
+"""Distance outside the limits at which a motion may begin: weight presses a servo beyond its stop.
+The first goal is within the limits [rad]."""
 _LONGEST_WITHOUT_TEMPERATURE = 2 * TEMPERATURE_CYCLES + 10
 """Cycles without a servo's temperature that stop the motion.
 
-Replies that are missing for longer do so before.
+Missing replies stop it earlier.
 """
 
 
 def exceeds(value: npt.ArrayLike, limit: npt.ArrayLike) -> BoolArray:
-    """True where a value is not known to be at most a limit.
-
-    It is greater, or one of the two is nan or infinite.
+    """Return True where a value is greater than its limit, or one of the two is not finite.
 
     Args:
         value: (...), in the unit of the limit.
-        limit: (...), likewise.
+        limit: (...), in the same unit.
 
     Returns:
-        (...), of one value a single one.
+        (...).
     """
     values = np.asarray(value, dtype=np.float64)
-    most = np.asarray(limit, dtype=np.float64)
-    return ~(np.isfinite(values) & np.isfinite(most) & (values <= most))
+    limits = np.asarray(limit, dtype=np.float64)
+    return ~(np.isfinite(values) & np.isfinite(limits) & (values <= limits))
 
 
 def is_outside(value: Any, lowest: npt.ArrayLike, highest: npt.ArrayLike) -> BoolArray:
-    """True where a value is not known to lie between two bounds, or on one of them.
+    """Return True where a value lies outside two bounds, or a number is not finite.
 
     Shapes as in `exceeds`.
     """
@@ -51,20 +49,20 @@ def is_outside(value: Any, lowest: npt.ArrayLike, highest: npt.ArrayLike) -> Boo
 
 
 class Guard:
-    """Keeps commands within limits, and notices when the measured state leaves them.
+    """Keeps commands within limits, and detects when the measured state leaves them.
 
     Args:
-        limits: The limits, the same for all servos but for `ranges`.
-        measured: Positions where the motion begins, (n,) [rad]; the first commands can only lead
-            away from there as fast as the limits allow.
-        names: The servos' names in messages, (n,).
-        hottest: Temperatures that the servos' own settings allow, (n,) [°C]; the lower one of each
-            and the limit holds.
+        limits: Limits of all servos; `ranges` may replace those of position.
+        measured: Positions where the motion begins, (n,) [rad]; commands depart from there no
+            faster than the limits allow.
+        names: Names of the servos in messages, (n,).
+        hottest: Temperatures that the servos' own settings allow, (n,) [°C]; the lower of this and
+            the limit holds.
         strongest: Torques that the servos may give for long, (n,) [N·m]; likewise.
         ranges: Lowest and highest goal of each servo, (n, 2) [rad]; None for those of the limits.
 
     Raises:
-        FaultError: A position lies outside the goals' range, or is not known.
+        FaultError: A position lies outside the range of goals, or is not known.
     """
 
     def __init__(
@@ -84,11 +82,11 @@ class Guard:
         self._lowest, self._highest = (ends if ranges is None else ranges).T
         self._hottest: Array = np.minimum(np.full(n, limits.temperature_c), hottest)
         self._strongest: Array = np.minimum(np.full(n, limits.torque_nm), strongest)
-        # cycles in a row, (n,) each
+        # consecutive cycles, (n,) each
         self._without_reply: IntArray = np.zeros(n, dtype=np.int64)
         self._without_temperature: IntArray = np.zeros(n, dtype=np.int64)
         self._strained: IntArray = np.zeros(n, dtype=np.int64)
-        # the margin is for what is measured on the way; where a motion begins is its first goal
+        # the margin is for positions on the way; the first position becomes the first goal
         slack = _START_SLACK_RAD
         outside = is_outside(self.goals, self._lowest - slack, self._highest + slack)
         if outside.any():
@@ -101,49 +99,48 @@ class Guard:
 
     @property
     def is_holding(self) -> bool:
-        """True if a reply was missing in the last cycle, and so the last command is repeated."""
+        """True if a reply was missing in the last cycle; the last command is then repeated."""
         return bool(self._without_reply.any())
 
     def command(self, goals: Array, elapsed_s: float) -> tuple[Array, BoolArray]:
-        """Limit what is asked for.
+        """Limit the goals of a command.
 
         Args:
-            goals: Positions asked for, (n,) [rad].
+            goals: Desired positions, (n,) [rad].
             elapsed_s: Time since the last command [s].
 
         Returns:
-            Goals within position and slew limits, and where they differ from what was asked for.
+            Goals within position and slew limits, (n,) [rad], and True where a limit changed them.
 
         Raises:
-            FaultError: A goal is not a finite number, or the time is none.
+            FaultError: A goal or the time is not a finite number, or the time is negative.
         """
-        asked = np.asarray(goals, dtype=np.float64)
+        desired = np.asarray(goals, dtype=np.float64)
         n = len(self.goals)
-        if asked.shape != (n,) or not np.isfinite(asked).all():
-            found = np.asarray(goals).tolist()
-            raise FaultError(f"goals must be {n} finite angles [rad], got {found}")
+        if desired.shape != (n,) or not np.isfinite(desired).all():
+            got = np.asarray(goals).tolist()
+            raise FaultError(f"goals must be {n} finite angles [rad], got {got}")
         if is_outside(elapsed_s, 0.0, np.finfo(np.float64).max):
             needed = f"at least 0 s and finite, got {elapsed_s} s"
             raise FaultError(f"the time since the last command must be {needed}")
         if not self.is_holding:
             reach = self.limits.slew_rad_s * elapsed_s
-            within = np.clip(asked, self._lowest, self._highest)
+            within = np.clip(desired, self._lowest, self._highest)
             self.goals = np.clip(within, self.goals - reach, self.goals + reach)
-        return self.goals.copy(), self.goals != asked
+        return self.goals.copy(), self.goals != desired
 
     def check(self, states: States) -> str:
-        """Take a cycle's replies.
+        """Check the replies of a cycle.
 
         Returns:
-            Why the motion must stop, "" if it need not.
+            Reason to stop the motion, "" if there is none.
         """
         limits = self.limits
         is_fresh = states.is_fresh
         motion = np.stack([states.position, states.velocity, states.torque])
         unreal = is_fresh & ~np.isfinite(motion).all(axis=0)
         if unreal.any():
-            servos = self._list(unreal)
-            return f"position, velocity or torque of {servos} is not a finite number"
+            return f"position, velocity or torque of {self._list(unreal)} is not a finite number"
         if states.has_alert.any():
             return "a servo reports a hardware error"
         self._without_reply = np.where(is_fresh, 0, self._without_reply + 1)
@@ -177,19 +174,21 @@ class Guard:
         return self._check_load(states) or self._check_heat(states.temperature)
 
     def _check_load(self, states: States) -> str:
+        """Reason to stop by the torques, "" if there is none."""
         torque = np.abs(states.torque)
         is_strained = exceeds(torque, self._strongest)
         strained = np.where(is_strained, self._strained + 1, 0)
-        # a missing reply tells neither way
+        # a missing reply changes no count
         self._strained = np.where(states.is_fresh, strained, self._strained)
         too_long = states.is_fresh & (self._strained >= self.limits.patience_cycles)
         if too_long.any():
             torques = self._list(too_long, torque)
-            allowed = ", ".join(f"{one:g}" for one in self._strongest[too_long])
+            allowed = ", ".join(f"{limit:g}" for limit in self._strongest[too_long])
             return f"the torque exceeds {allowed} N·m: {torques} N·m"
         return ""
 
     def _check_heat(self, temperature: Array) -> str:
+        """Reason to stop by the temperatures, "" if there is none."""
         is_missing = np.isnan(temperature)
         missed = self._without_temperature + 1
         self._without_temperature = np.where(is_missing, missed, 0)
@@ -203,26 +202,26 @@ class Guard:
             return f"no temperature from {servos} in {longest} cycles: elastic hardware check"
         return ""
 
-    def _ends(self, are: BoolArray, between: str) -> str:
-        """Ranges of the goals of some servos [rad], each once."""
-        ends = zip(self._lowest[are], self._highest[are], strict=True)
+    def _ends(self, selected: BoolArray, between: str) -> str:
+        """Text of the ranges of some servos' goals [rad], each once."""
+        ends = zip(self._lowest[selected], self._highest[selected], strict=True)
         ranges = [f"{low:.3f}{between}{high:.3f}" for low, high in ends]
         return ", ".join(dict.fromkeys(ranges))
 
-    def _list(self, are: BoolArray, values: Array | None = None) -> str:
-        """Names of some servos, with their values."""
-        chosen = np.flatnonzero(are)
+    def _list(self, selected: BoolArray, values: Array | None = None) -> str:
+        """Text of the names of some servos, with their values."""
+        indices = np.flatnonzero(selected)
         if values is None:
-            return ", ".join(self._names[i] for i in chosen)
-        return ", ".join(f"{self._names[i]}: {values[i]:.3f}" for i in chosen)
+            return ", ".join(self._names[i] for i in indices)
+        return ", ".join(f"{self._names[i]}: {values[i]:.3f}" for i in indices)
 
 
 def explain_heat(which: str, hottest: Array) -> str:
-    """Words for servos that are too hot.
+    """Message about servos that are too hot.
 
     Args:
         which: Their names with their temperatures [°C].
-        hottest: Temperature that each may have, (n,) [°C].
+        hottest: Highest allowed temperature of each, (n,) [°C].
     """
     limits = [f"{degrees:g}" for degrees in np.atleast_1d(hottest)]
     allowed = ", ".join(dict.fromkeys(limits))

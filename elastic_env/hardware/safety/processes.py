@@ -1,15 +1,15 @@
-"""Processes beside the program: how they start, talk to each other, and are seen to end.
+"""Child processes: their start, their messages, and the detection of their end.
 
-`python -m` puts the working directory first on the import path. A `serial.py` that lies there would
-run in the process that is to switch torque off. Here a child
+`python -m` puts the working directory first on the import path. A `serial.py` there would run in
+the process that must switch torque off. Here a child
 
-* has no working directory on its path: by `-P`, and by a PYTHONPATH without it in whatever
-  spelling. Everything else of PYTHONPATH and the user's own packages stay, since the driver's
-  packages may be installed there (`-I` would drop them);
-* loads our packages from where this program has them, which may be the working directory, without
-  looking for them.
+* has no working directory on its path: by `-P`, and by a PYTHONPATH without any spelling of it.
+  The rest of PYTHONPATH and the user's own packages stay, since the driver's packages may be
+  installed there (`-I` would drop them);
+* loads our packages from the folders of this program, one of which may be the working directory,
+  without a search.
 
-This file is the first that a child runs: it imports the standard library alone.
+A child runs this file first: it imports only the standard library.
 """
 
 import importlib
@@ -39,24 +39,23 @@ _FLAGS = 6  # of the fields behind the name, see proc(5)
 
 
 def child_command(module: str, *arguments: str) -> list[str]:
-    """The command that runs a module of ours in a process of its own.
+    """Command that runs a module of ours in a child process.
 
     Args:
-        module: Such as elastic_env.hardware.safety.supervisor.
-        *arguments: What it finds in `sys.argv`.
+        module: Name of the module, such as elastic_env.hardware.safety.supervisor.
+        *arguments: Its arguments in `sys.argv`.
     """
     names = dict.fromkeys((_PACKAGE, module.partition(".")[0]))
     folders = os.pathsep.join(str(_folder(name)) for name in names)
-    this = str(Path(__file__).resolve())
-    return [sys.executable, "-P", this, folders, module, *arguments]
+    return [sys.executable, "-P", str(Path(__file__).resolve()), folders, module, *arguments]
 
 
 def start_child(module: str, *arguments: str, **options: Any) -> Process:
-    """Run a module of ours in a process and a session of its own.
+    """Run a module of ours in a child process with its own session.
 
     Args:
         module: As in `child_command`.
-        *arguments: Likewise.
+        *arguments: As in `child_command`.
         **options: Further arguments of `subprocess.Popen`: its pipes and descriptors.
     """
     command = child_command(module, *arguments)
@@ -66,10 +65,7 @@ def start_child(module: str, *arguments: str, **options: Any) -> Process:
 
 
 def end_child(process: Process, within_s: float) -> None:
-    """End a child that stops when its input is closed.
-
-    One that does not within a time [s] is killed.
-    """
+    """End a child that stops when its input is closed; kill it if it does not within a time [s]."""
     for pipe in (process.stdin, process.stdout, process.stderr):
         if pipe is not None:
             pipe.close()
@@ -81,20 +77,20 @@ def end_child(process: Process, within_s: float) -> None:
 
 
 def child_environment(environment: Mapping[str, str] = os.environ) -> dict[str, str]:
-    """The environment of a child: this program's, with no working directory in its PYTHONPATH.
+    """Environment variables of a child, without the working directory in PYTHONPATH.
 
     Args:
         environment: Variables by name, default those of this program.
     """
-    found = environment.get(_PATH, "").split(os.pathsep)
-    here = os.path.realpath(".")  # which an empty entry means too
-    entries = [entry for entry in found if entry and os.path.realpath(entry) != here]
+    here = os.path.realpath(".")  # an empty entry means the same
+    folders = environment.get(_PATH, "").split(os.pathsep)
+    entries = [folder for folder in folders if folder and os.path.realpath(folder) != here]
     others = {name: value for name, value in environment.items() if name != _PATH}
     return {**others, _PATH: os.pathsep.join(entries)} if entries else others
 
 
 def _folder(package: str) -> Path:
-    """The folder from which this program has a package."""
+    """Folder from which this program has loaded a package."""
     file = importlib.import_module(package).__file__
     assert file is not None
     return Path(file).resolve().parent
@@ -124,7 +120,7 @@ class Channel:
     """One end of a pair of sockets for messages, one JSON object each.
 
     Args:
-        end: A socket that keeps messages apart (SOCK_SEQPACKET).
+        end: Socket that keeps messages separate (SOCK_SEQPACKET).
     """
 
     def __init__(self, end: socket.socket) -> None:
@@ -132,11 +128,11 @@ class Channel:
 
     @staticmethod
     def pair() -> tuple[socket.socket, socket.socket]:
-        """Both ends."""
+        """Create both ends."""
         return socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
 
     def send(self, message: dict[str, Any]) -> None:
-        """Send.
+        """Send a message.
 
         Raises:
             OSError: The other end is gone.
@@ -144,11 +140,11 @@ class Channel:
         self._end.send(json.dumps(message).encode())
 
     def is_waiting(self, timeout_s: float | None) -> bool:
-        """True if a message, or the end of the other side, comes within a time."""
+        """Wait for a time; return True once a message comes, or the other end closes."""
         return bool(select.select([self._end], [], [], timeout_s)[0])
 
     def receive(self) -> dict[str, Any] | None:
-        """The next message; None if the other end is gone."""
+        """Receive the next message; None if the other end is gone."""
         try:
             data = self._end.recv(_LONGEST_MESSAGE)
         except ConnectionError:
@@ -161,17 +157,17 @@ class Channel:
 
 
 def is_ending(process_id: int, proc: Path = _PROC) -> bool:
-    """True if a process has been killed, ends, writes its core, or is gone.
+    """Return True if a process has been killed, is ending, writes its core, or is gone.
 
-    False where the system does not tell.
+    Return False if the system does not report it.
 
-    A program that is killed closes its end of a channel late. It first needs a processor to end on,
-    and gives its memory back before its files. On a busy computer that takes as long as a hang
-    does. Linux tells of it at once.
+    A killed program closes its end of a channel late. It first needs a processor to end on, and
+    releases its memory before its files. On a busy computer that takes as long as a hang does.
+    Linux reports the kill at once.
 
     Args:
-        process_id: Of the process.
-        proc: Folder in which Linux tells of processes.
+        process_id: Id of the process.
+        proc: Folder in which Linux describes processes.
     """
     folder = proc / str(process_id)
     try:

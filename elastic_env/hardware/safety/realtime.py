@@ -10,11 +10,11 @@ from elastic_env.hardware.clock import Clock
 from elastic_env.hardware.safety.guard import exceeds
 
 LONGEST_WAIT_S = 0.02
-"""How far ahead a control cycle may ask to be read [s]."""
+"""Longest time from the request of a control cycle to its reading [s]."""
 
 
 class Priority(IntEnum):
-    """Order of the processes: those that end a motion go before those that move, however busy."""
+    """Order of the processes: those that end a motion run before those that move, however busy."""
 
     LOOP = 5
     IMU_READER = 10
@@ -23,15 +23,15 @@ class Priority(IntEnum):
 
 
 def prefer_realtime(priority: Priority, *, with_threads: bool = False) -> bool:
-    """Ask for real-time scheduling of this thread, to which a program needs the right, see docs.
+    """Request real-time scheduling of this thread; a program needs a permission, see docs.
 
-    What is in memory now is left out of garbage collections: one that looks at all of it takes ten
-    control periods.
+    Objects that exist now are left out of garbage collections: a full collection takes ten control
+    periods.
 
     Args:
-        priority: Among the processes of a motion.
-        with_threads: True if threads and programs that it starts from now on get the same; else
-            they run as others do.
+        priority: Priority among the processes of a motion.
+        with_threads: True to schedule threads and programs that it starts later in the same way;
+            else they run as usual.
 
     Returns:
         True if the system grants it.
@@ -39,19 +39,17 @@ def prefer_realtime(priority: Priority, *, with_threads: bool = False) -> bool:
     gc.collect()
     gc.freeze()
     with contextlib.suppress(OSError, AttributeError):
-        policy = os.SCHED_FIFO
-        if not with_threads:
-            policy |= os.SCHED_RESET_ON_FORK
+        policy = os.SCHED_FIFO | (0 if with_threads else os.SCHED_RESET_ON_FORK)
         os.sched_setscheduler(0, policy, os.sched_param(priority))
         return True
     return False
 
 
 def schedule_like(thread_id: int) -> None:
-    """Schedule this thread as another of this program is.
+    """Schedule this thread like another one of this program.
 
     Args:
-        thread_id: Native id of the other.
+        thread_id: Native id of the other thread.
     """
     with contextlib.suppress(OSError, AttributeError):
         policy = os.sched_getscheduler(thread_id)
@@ -59,9 +57,9 @@ def schedule_like(thread_id: int) -> None:
 
 
 def give_up_realtime() -> None:
-    """Back to the scheduling of all others, and to collections of everything."""
+    """Return to the usual scheduling, and to full garbage collections."""
     gc.unfreeze()
-    # the flag may be taken back with special rights only
+    # clearing the flag needs special rights
     with contextlib.suppress(OSError, AttributeError):
         policy = os.SCHED_OTHER | os.SCHED_RESET_ON_FORK
         os.sched_setscheduler(0, policy, os.sched_param(0))
@@ -77,13 +75,13 @@ def sleep_until(moment_s: float, clock: Clock = time) -> None:
 class Pace:
     """Moments at which a control loop reads, one period after the other.
 
-    Small delays are caught up with. An overrun is a period whose command comes, or whose reading
-    happens, more than half a period late: a new one begins there, so that one hold-up counts once
-    and what follows has its whole time.
+    The loop catches up with small delays. An overrun is a period whose command or reading is more
+    than half a period late. A new period begins there, so that one hold-up counts once and the next
+    period has its whole time.
 
     Args:
         period_s: Time between readings [s].
-        clock: Its clock; default the system's.
+        clock: Clock of the loop; default the system's.
     """
 
     def __init__(self, period_s: float, clock: Clock = time) -> None:
@@ -92,12 +90,12 @@ class Pace:
         self.restart()
 
     def restart(self) -> None:
-        """A period begins now."""
+        """Begin a period now."""
         self._due_s = self._clock.monotonic()
         self._lost_s = 0.0
 
     def next(self) -> float:
-        """When to read, for a command that is ready now: not before now [s, monotonic clock]."""
+        """Moment to read for a command that is ready now, not before now [s, monotonic clock]."""
         now = self._clock.monotonic()
         self._due_s += self._period_s
         self._lost_s = now - self._due_s
@@ -108,10 +106,10 @@ class Pace:
         return self._due_s
 
     def late(self, moment_s: float) -> float:
-        """How late the last period was read, or its command came [s].
+        """Delay of the last period's command and reading [s].
 
         Args:
-            moment_s: When it was read [s, monotonic clock].
+            moment_s: Moment of the reading [s, monotonic clock].
         """
         late_s = moment_s - self._due_s
         if self.is_overrun(late_s):
@@ -119,5 +117,5 @@ class Pace:
         return self._lost_s + late_s
 
     def is_overrun(self, late_s: float) -> bool:
-        """True if a period that was so late counts as lost."""
+        """Return True if a period with such a delay counts as lost."""
         return bool(exceeds(late_s, 0.5 * self._period_s))

@@ -1,10 +1,10 @@
-"""A program's side of the supervisor: servos that lose their torque when it does not behave."""
+"""A program's side of the supervisor: servos that lose their torque when the program fails."""
 
 import contextlib
 import subprocess
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Self
 
@@ -15,10 +15,10 @@ from elastic_env.hardware import errors
 from elastic_env.hardware.buses.bus import States
 from elastic_env.hardware.buses.packets import require_ids
 from elastic_env.hardware.buses.protocols import BUSES
-from elastic_env.hardware.buses.servo_bus import BusGroup
 from elastic_env.hardware.buses.servo_models import Protocol
 from elastic_env.hardware.clock import Clock
-from elastic_env.hardware.errors import FaultError, HardwareError, ReplyError
+from elastic_env.hardware.errors import FaultError, HardwareError
+from elastic_env.hardware.safety.emergency_stop import switch_torque_off
 from elastic_env.hardware.safety.processes import Channel, start_child
 from elastic_env.hardware.safety.realtime import LONGEST_WAIT_S, schedule_like
 from elastic_env.hardware.settings import SafetyLimits
@@ -26,15 +26,12 @@ from elastic_env.hardware.settings import SafetyLimits
 _SUPERVISOR = "elastic_env.hardware.safety.supervisor"
 _KEEP_ALIVE_S = 0.008
 _ANSWER_S = 0.1
-"""Longest silence of a supervisor beyond what was asked for [s].
+"""Longest silence of a supervisor beyond the wait of a request [s].
 
-Then it is taken for dead, and torque switched off.
-
-In motion it is `SafetyLimits.hang_s`, as for the program: what makes one of the two wait makes the
-other wait too.
+After it the supervisor counts as dead, and torque is switched off. In motion the silence is
+`SafetyLimits.hang_s`, as for the program: what delays one of the two delays the other too.
 """
 _LEAST_ANSWER_S = 0.02
-_READ_S = 0.05
 _SLOW_S = 5.0
 _SLOW_PER_SERVO_S = 1.0
 _START_S = 30.0
@@ -49,15 +46,15 @@ class Cycle:
     goals: Array
     """Commanded positions, (n,) [rad]."""
     is_limited: BoolArray
-    """True where that is not what was asked for, (n,)."""
+    """True where a limit changed the position, (n,)."""
     is_held: bool
     """True if the last command was repeated because a reply was missing."""
     late_s: float
-    """How much later than asked for the servos were read [s]."""
+    """Delay of the reading after the requested moment [s]."""
 
     @classmethod
     def load(cls, answer: dict[str, Any]) -> Self:
-        """The cycle that a supervisor answers."""
+        """Cycle from a supervisor's answer."""
         goals, is_limited = (np.array(answer[name]) for name in ("goals", "is_limited"))
         late_s = float(answer["late_s"])
         return cls(States.load(answer), goals, is_limited, bool(answer["is_held"]), late_s)
@@ -69,19 +66,19 @@ class SupervisedBus(contextlib.AbstractContextManager["SupervisedBus"]):
     Args:
         ports: Ids of the servos by port; arrays of all servos have them in this order.
         baudrate: Bits per second; None for the usual rate of the protocol.
-        protocol: Of all servos.
+        protocol: Protocol of all servos.
 
     Attributes:
         models: Model numbers of the servos, a list for each port.
-        clock: By which they are read.
-        is_confirmed_off: Whether all servos have said that their torque is off, and nothing has
-            enabled it since.
+        clock: Clock of the readings.
+        is_confirmed_off: True if all servos have confirmed that their torque is off, and nothing
+            has enabled it since.
 
     Raises:
-        PortError: A port cannot be had.
-        ConfigurationError: Ids that no servo can have, or one twice.
+        PortError: A port cannot be opened.
+        ConfigurationError: An id is impossible, or given twice.
         ReplyError: A servo does not answer.
-        HardwareError: Its model is not known, or something is set such that nothing may move.
+        HardwareError: The model of a servo is not known, or its settings forbid motion.
     """
 
     def __init__(
@@ -102,16 +99,16 @@ class SupervisedBus(contextlib.AbstractContextManager["SupervisedBus"]):
         self._number = 0
         self._answer_s = _ANSWER_S
         self._hint = ""
-        """Words for an answer that did not come in motion."""
+        """Text for an answer that did not come in motion."""
         # for confirmations and checks: several tries for each servo that does not answer
         self._slow_s = _SLOW_S + _SLOW_PER_SERVO_S * sum(map(len, self._ports.values()))
         self._lock = threading.Lock()
         self._keeper: threading.Thread | None = None
         self._is_kept = threading.Event()
-        own, other = Channel.pair()
-        self._channel = Channel(own)
-        with other:
-            file = other.fileno()
+        own_end, other_end = Channel.pair()
+        self._channel = Channel(own_end)
+        with other_end:
+            file = other_end.fileno()
             arguments = (str(file), str(self._baudrate), protocol, *ports)
             options = {"pass_fds": [file], "stdin": subprocess.DEVNULL}
             self._process = start_child(_SUPERVISOR, *arguments, **options)
@@ -129,36 +126,35 @@ class SupervisedBus(contextlib.AbstractContextManager["SupervisedBus"]):
         return self._process.pid
 
     def enable(self, limits: SafetyLimits | None = None, ranges: Array | None = None) -> Array:
-        """Torque on where the servos stand.
+        """Switch torque on at the present positions.
 
         Args:
             limits: Limits of all servos.
             ranges: Lowest and highest goal of each, (n, 2) [rad]; None for those of the limits.
 
         Returns:
-            Their positions, (n,) [rad].
+            The positions, (n,) [rad].
 
         Raises:
             FaultError: A servo reports a hardware error, moves, or stands outside the limits.
-            ReplyError: A servo does not answer, or does not take the goal where it stands.
+            ReplyError: A servo does not answer, or refuses its position as goal.
             BusGoneError: The port is gone.
         """
         limits = limits or SafetyLimits()
         self._is_enabled = True
         self.is_confirmed_off = False
         ends = None if ranges is None else ranges.tolist()
-        arguments = {"limits": limits.model_dump(), "ranges": ends}
-        answer = self._request("enable", self._slow_s, **arguments)
+        answer = self._request("enable", self._slow_s, limits=limits.model_dump(), ranges=ends)
         self._answer_s = max(limits.hang_s, _LEAST_ANSWER_S)
         self._hint = limits.patience_hint("hang_s") or "; end what else keeps the computer busy"
         return np.array(answer["position"])
 
     def exchange(self, goals: Array, at: float) -> Cycle:
-        """One control cycle: command, wait for a moment of the monotonic clock, read.
+        """Run one control cycle: command, wait for a moment of the monotonic clock, read.
 
         Args:
-            goals: Positions asked for, (n,) [rad].
-            at: When to read [s]; at most 20 ms ahead.
+            goals: Desired positions, (n,) [rad].
+            at: Moment of the reading [s]; at most 20 ms ahead.
 
         Raises:
             FaultError: The motion was stopped, now or since the last cycle; the message says why.
@@ -168,23 +164,19 @@ class SupervisedBus(contextlib.AbstractContextManager["SupervisedBus"]):
         try:
             answer = self._exchange(np.asarray(goals, dtype=np.float64), at)
         except HardwareError:
-            self._is_enabled = False  # the message says what became of torque
+            self._is_enabled = False  # the message says whether torque is off
             raise
         except BaseException:
-            # torque off after an interrupted cycle, whatever its answer would have been
+            # torque off after an interrupted cycle, whatever its answer
             with contextlib.suppress(HardwareError, OSError):
                 self._request("disable", _ANSWER_S)
             raise
         return Cycle.load(answer)
 
-    def read_states(self) -> States:
-        """States without a command."""
-        return States.load(self._request("read", _READ_S + self._answer_s))
-
     def keep(self, goals: Array, limit_s: float = 5.0) -> None:
         """Hold goals from a thread until the next cycle, for at most a time [s].
 
-        A program that hangs as a whole takes the thread with it, and torque goes off as ever.
+        If the whole program hangs, so does the thread, and torque goes off as usual.
         """
         self.stop_keeping()
         self._is_kept.set()
@@ -193,7 +185,7 @@ class SupervisedBus(contextlib.AbstractContextManager["SupervisedBus"]):
         self._keeper.start()
 
     def stop_keeping(self) -> None:
-        """End what `keep` began."""
+        """End the holding of goals by `keep`."""
         if self._keeper is not None:
             self._is_kept.clear()
             self._keeper.join()
@@ -206,14 +198,13 @@ class SupervisedBus(contextlib.AbstractContextManager["SupervisedBus"]):
                 self._exchange(goals, time.monotonic() + _KEEP_ALIVE_S)
 
     def _exchange(self, goals: Array, at: float) -> dict[str, Any]:
-        # the supervisor refuses to wait longer, or for a moment that is none; max gives 0 for nan
-        # as its second value
+        # the supervisor refuses to wait longer, or for a moment of nan; max gives 0 for nan as its
+        # second value
         wait_s = min(max(0.0, at - time.monotonic()), LONGEST_WAIT_S)
-        within_s = wait_s + self._answer_s
-        return self._request("exchange", within_s, goals=goals.tolist(), at=at)
+        return self._request("exchange", wait_s + self._answer_s, goals=goals.tolist(), at=at)
 
     def disable(self) -> None:
-        """Torque off.
+        """Switch torque off.
 
         Raises:
             ReplyError: A servo does not confirm it.
@@ -226,10 +217,10 @@ class SupervisedBus(contextlib.AbstractContextManager["SupervisedBus"]):
         self.is_confirmed_off = True
 
     def close(self) -> None:
-        """Torque off, and give the ports back; a second time does nothing.
+        """Switch torque off and release the ports; a second call does nothing.
 
         Raises:
-            ReplyError: A servo does not confirm that its torque is off; the ports are given back
+            ReplyError: A servo does not confirm that its torque is off; the ports are released
                 all the same.
             BusGoneError: The port is gone.
         """
@@ -248,7 +239,7 @@ class SupervisedBus(contextlib.AbstractContextManager["SupervisedBus"]):
         self.close()
 
     def _request(self, action: str, within_s: float, **arguments: Any) -> Any:
-        """The answer to a request, which must come within a time [s]."""
+        """Send a request and return its answer, which must come within a time [s]."""
         with self._lock:
             self._number += 1
             request = {"number": self._number, "do": action, "with": arguments}
@@ -259,13 +250,13 @@ class SupervisedBus(contextlib.AbstractContextManager["SupervisedBus"]):
             return self._receive(self._number, within_s)
 
     def _receive(self, number: int, within_s: float) -> dict[str, Any]:
-        """The answer of a number; those of requests that were interrupted are passed over."""
+        """Receive the answer with a number, and skip answers to interrupted requests."""
         end_s = time.monotonic() + within_s
         while self._channel.is_waiting(max(end_s - time.monotonic(), 0.0)):
             answer = self._channel.receive()
             if answer is None:
                 raise self._replace_supervisor()
-            if "busy" in answer:  # torque off is sent; its confirmation takes longer
+            if "busy" in answer:  # the servos take longer to confirm torque off
                 within_s = self._slow_s
                 end_s = time.monotonic() + within_s
             elif answer["number"] == number:
@@ -276,68 +267,14 @@ class SupervisedBus(contextlib.AbstractContextManager["SupervisedBus"]):
         raise self._replace_supervisor(within_s)
 
     def _replace_supervisor(self, silent_s: float | None = None) -> FaultError:
-        """Switch torque off for a supervisor that died, or was silent for a time [s]."""
+        """Switch torque off instead of a supervisor that died, or was silent for a time [s]."""
         with contextlib.suppress(subprocess.TimeoutExpired):
             # its end of the channel closes before its port does
             self._process.wait(timeout=1.0)
         if silent_s is None:
-            how = f"ended (exit code {self._process.poll()})"
+            end = f"ended (exit code {self._process.poll()})"
         else:
-            how = f"did not answer within {1e3 * silent_s:.0f} ms and was ended"
-        known = (self._baudrate, self.models, self._protocol)
-        outcome = emergency_stop(self._ports, *known)
+            end = f"did not answer within {1e3 * silent_s:.0f} ms and was ended"
+        outcome = switch_torque_off(self._ports, self._baudrate, self.models, self._protocol)
         hint = "" if silent_s is None else self._hint
-        return FaultError(f"the supervisor process {how}; {outcome}{hint}")
-
-
-def emergency_stop(
-    ports: Mapping[str, Sequence[int]],
-    baudrate: int | None = None,
-    models: Sequence[Sequence[int]] = (),
-    protocol: Protocol = "dynamixel",
-) -> str:
-    """Switch torque off without a supervisor.
-
-    Args:
-        ports: Ids of the servos by port.
-        baudrate: Bits per second; None for the usual rate of the protocol.
-        models: Their model numbers, in that order; where they are not given each servo is asked for
-            its own first.
-        protocol: Of all servos.
-
-    Returns:
-        What came of it, in words.
-    """
-    problems: list[str] = []
-
-    @contextlib.contextmanager
-    def noting(kind: type[HardwareError]) -> Iterator[None]:
-        try:
-            yield
-        except kind as error:
-            problems.append(f"torque could not be switched off: {error}")
-
-    buses = [BUSES[protocol](port, baudrate) for port in ports]
-    try:
-        for number, (bus, ids) in enumerate(zip(buses, ports.values(), strict=True)):
-            with noting(HardwareError):
-                bus.open()
-                known = dict(zip(ids, models[number], strict=True)) if models else {}
-                for servo_id in ids if not models else ():
-                    # one that does not answer keeps no other on
-                    with noting(ReplyError):
-                        known[servo_id] = bus.ping(servo_id).model_number
-                # a model of zero is none, and keeps no other servo on
-                bus.attach_known({i: model for i, model in known.items() if model})
-        reached = [bus for bus in buses if bus.models]
-        problem = BusGroup(reached).torque_off() if reached else None
-    finally:
-        for bus in buses:
-            # one that is gone cannot be closed
-            with contextlib.suppress(HardwareError):
-                bus.close()
-    if problem is not None:
-        problems.append(str(problem))
-    elif reached:
-        problems.append("torque of the others is off" if problems else "torque is off")
-    return "; ".join(dict.fromkeys(problems))
+        return FaultError(f"the supervisor process {end}; {outcome}{hint}")

@@ -1,13 +1,12 @@
-"""The process that owns the servos' ports: it relays, keeps limits, and switches torque off.
+"""The process that owns the servos' ports: it relays commands, limits them, and ends motions.
 
-It lives in a session of its own, so that neither Ctrl-C nor the death of the program that started
-it ends it before torque is off. Torque goes off when
+It has its own session, so that neither Ctrl-C nor the death of the program that started it ends it
+before torque is off. Torque goes off when
 
-* the program ends, however it ends: its end of the channel closes, or Linux says that it is about
-  to;
+* the program ends in any way: its end of the channel closes, or Linux reports that it is ending;
 * no command comes for `SafetyLimits.hang_s`: the program hangs;
-* the `Guard` finds a reason in what is measured;
-* it is itself asked to end (SIGTERM, SIGHUP, SIGINT), also during a read, also more than once.
+* the `Guard` finds a reason in the measurements;
+* the supervisor itself must end (SIGTERM, SIGHUP, SIGINT), also during a read, also repeatedly.
 """
 
 import contextlib
@@ -19,27 +18,24 @@ from typing import Any, cast
 
 import numpy as np
 
-from elastic_env.hardware.buses.bus import Condition, States
+from elastic_env.hardware.buses.bus import States
+from elastic_env.hardware.buses.bus_group import BusGroup
+from elastic_env.hardware.buses.packet_line import servo_name
 from elastic_env.hardware.buses.protocols import BUSES
-from elastic_env.hardware.buses.servo_bus import BusGroup, ServoBus, servo_name
+from elastic_env.hardware.buses.servo_bus import ServoBus
 from elastic_env.hardware.buses.servo_models import Protocol
 from elastic_env.hardware.errors import BusGoneError, FaultError, HardwareError
 from elastic_env.hardware.safety import realtime
-from elastic_env.hardware.safety.checks import check_bus
-from elastic_env.hardware.safety.guard import Guard, exceeds, explain_heat
+from elastic_env.hardware.safety.checks import check_bus, require_ready
+from elastic_env.hardware.safety.guard import Guard, exceeds
 from elastic_env.hardware.safety.processes import Channel, is_ending
 from elastic_env.hardware.safety.realtime import LONGEST_WAIT_S
 from elastic_env.hardware.settings import SafetyLimits
 
 _GLANCE_S = 0.005
-"""Silence after which to look whether the program lives; a command comes every 4 ms [s]."""
-_REST_RAD_S = 0.2
-"""Speed below which a servo counts as at rest [rad/s].
-
-One that gets its torque in motion is stopped with a jerk.
-"""
-_ACTIONS = ("attach", "enable", "exchange", "read", "disable")
-"""What a program can ask for."""
+"""Silence after which to check that the program lives; a command comes every 4 ms [s]."""
+_ACTIONS = ("attach", "enable", "exchange", "disable")
+"""Requests that a program can send."""
 _SIGNALS = (signal.SIGTERM, signal.SIGHUP, signal.SIGINT)
 
 
@@ -47,8 +43,8 @@ class Supervisor:
     """Answers a program's requests for servos on one port or several.
 
     Args:
-        channel: To the program.
-        buses: Open, without servos attached.
+        channel: Channel to the program.
+        buses: Open buses without attached servos.
         program: Process id of the program.
     """
 
@@ -78,39 +74,40 @@ class Supervisor:
                 self._lower()
                 self._torque_off()
             except BaseException:
-                # a signal in this very moment; after it no other comes through
+                # a signal came in this very moment; later ones are ignored
                 self._torque_off()
                 raise
 
     def _next_request(self) -> dict[str, Any] | None:
-        """The next request; a program that hangs loses its torque meanwhile."""
+        """Wait for the next request, and stop the motion if the program hangs meanwhile.
+
+        Returns:
+            The request; None if the program ends.
+        """
         while True:
             is_moving = self._guard is not None
-            glance_s = min(self._patience_s(), _GLANCE_S) if is_moving else None
+            glance_s = min(self._remaining_s(), _GLANCE_S) if is_moving else None
             if self._channel.is_waiting(glance_s):
-                break
+                return self._channel.receive()
             if is_ending(self._program):
                 return None
-            self._stop_if_hanging()
-        request = self._channel.receive()
-        if request is not None and request["do"] == "read":
-            self._stop_if_hanging()  # reading is not commanding
-        return request
+            if self._guard is not None and self._remaining_s() == 0.0:
+                limits = self._guard.limits
+                hint = limits.patience_hint("hang_s")
+                self._stop(f"no command for {1e3 * limits.hang_s:.0f} ms: the program hangs{hint}")
 
-    def _patience_s(self) -> float:
-        """How long a command may still be waited for [s]; forever while nothing moves."""
+    def _remaining_s(self) -> float:
+        """Time until the program counts as hanging [s]; infinite while nothing moves."""
         if self._guard is None:
             return np.inf
         return max(self._served_s + self._guard.limits.hang_s - self._clock.monotonic(), 0.0)
 
-    def _stop_if_hanging(self) -> None:
-        if self._guard is not None and self._patience_s() == 0.0:
-            limits = self._guard.limits
-            hint = limits.patience_hint("hang_s")
-            self._stop(f"no command for {1e3 * limits.hang_s:.0f} ms: the program hangs{hint}")
-
     def answer(self, request: dict[str, Any]) -> dict[str, Any]:
-        """Do what is asked for; what came of it, or why nothing did."""
+        """Execute a request.
+
+        Returns:
+            Its result, or the error that it met.
+        """
         name = request["do"]
         if name not in _ACTIONS:
             choices = ", ".join(_ACTIONS)
@@ -125,22 +122,24 @@ class Supervisor:
             return {"error": type(fault).__name__, "message": str(fault)}
 
     def _attach(self, ids: list[list[int]]) -> dict[str, Any]:
+        """Check the servos of each bus, and attach them."""
         for bus, servo_ids in zip(self._buses, ids, strict=True):
-            checks = check_bus(bus, servo_ids)
-            bad = [check for check in checks if check.is_vital and not check.is_good]
-            if bad:
-                words = [f"{one.what} is {one.value}: {one.cure}" for one in bad]
-                listed = "; ".join(words)
-                raise HardwareError(f"nothing can move at {bus.name} yet: {listed}")
+            problems = [
+                f"{check.name} is {check.value}: {check.cure}"
+                for check in check_bus(bus, servo_ids)
+                if check.is_vital and not check.is_good
+            ]
+            if problems:
+                raise HardwareError(f"nothing can move at {bus.name} yet: {'; '.join(problems)}")
         models = [bus.models.values() for bus in self._buses]
         return {"models": [[model.number for model in of_bus] for of_bus in models]}
 
     def _enable(
         self, limits: dict[str, Any], ranges: list[list[float]] | None = None
     ) -> dict[str, Any]:
-        """Torque on, with every servo's goal where it stands."""
+        """Switch torque on, with the goal of every servo at its present position."""
         if isinstance(self._fault, BusGoneError):
-            # for good: what is plugged in again is another port
+            # final: an adapter that is plugged in again is another port
             raise self._fault.with_traceback(None)
         self._disable()
         safety_limits = SafetyLimits(**limits)
@@ -159,7 +158,7 @@ class Supervisor:
             for bus, servo_id in servos:
                 bus.write_watchdog(servo_id, False)
             for (bus, servo_id), angle in zip(servos, positions.tolist(), strict=True):
-                # confirmed: with torque, a servo may run to the goal it has
+                # confirmed: when torque goes on, a servo may run to an old goal
                 bus.write_goal(servo_id, angle)
             self._servos.restore_effort()
             for bus, servo_id in servos:
@@ -178,16 +177,15 @@ class Supervisor:
         return {"position": positions.tolist()}
 
     def _exchange(self, goals: list[float], at: float) -> dict[str, Any]:
-        """Command, wait for a moment, read.
+        """Command the servos, wait until a moment, read.
 
         The moment is on the monotonic clock, which both processes share.
         """
         guard = self._require_motion()
         now = self._clock.monotonic()
-        # rounded as the caller's sum is: a difference of the two can be above a wait that is not
+        # rounded like the caller's sum: the difference at - now may round above an allowed wait
         if exceeds(at, now + LONGEST_WAIT_S):
-            asked = f"asked for {at - now:.3f} s"
-            raise FaultError(f"a cycle may wait {LONGEST_WAIT_S} s, {asked}")
+            raise FaultError(f"a cycle may wait {LONGEST_WAIT_S} s, asked for {at - now:.3f} s")
         is_held = guard.is_holding
         elapsed_s = min(now - self._commanded_s, LONGEST_WAIT_S)
         allowed, is_limited = guard.command(np.array(goals), elapsed_s)
@@ -204,13 +202,8 @@ class Supervisor:
         commands = {"goals": allowed.tolist(), "is_limited": is_limited.tolist()}
         return {**states.dump(), **commands, "is_held": is_held, "late_s": begin - at}
 
-    def _read(self) -> dict[str, Any]:
-        """States without any command; while torque is on this counts as none."""
-        timeout_s = max(bus.reply_timeout_s for bus in self._buses)
-        return self._servos.read_states(timeout_s).dump()
-
     def _disable(self) -> dict[str, Any]:
-        """Torque off, confirmed."""
+        """Switch torque off, with confirmation."""
         self._lower()
         problem = self._torque_off()
         if problem is not None:
@@ -218,6 +211,11 @@ class Supervisor:
         return {}
 
     def _require_motion(self) -> Guard:
+        """Return the guard of the motion.
+
+        Raises:
+            HardwareError: Torque is off.
+        """
         if self._guard is not None:
             return self._guard
         if self._fault is not None:
@@ -225,7 +223,7 @@ class Supervisor:
         raise FaultError("torque is off; it must be enabled first")
 
     def _explain_alerts(self, states: States) -> str:
-        """Hardware errors of the servos that raised the alert bit, in words."""
+        """Text of the hardware errors of servos that set the alert bit; "" if none did."""
         errors: list[str] = []
         for number in np.flatnonzero(states.has_alert):
             bus, servo_id = self._servos.servos[number]
@@ -237,79 +235,54 @@ class Supervisor:
         return f" ({'; '.join(errors)})" if errors else ""
 
     def _stop(self, reason: str, is_gone: bool = False) -> HardwareError:
-        """End the motion for a reason; returns the error that answers from now on."""
+        """End the motion for a reason; return the error that answers later requests."""
         if not is_gone:
             self._lower()
         problem = self._torque_off()
         outcome = "torque is off" if problem is None else str(problem)
         kind = BusGoneError if isinstance(problem, BusGoneError) else FaultError
-        # torque off met the same loss
-        is_said = reason in outcome or (is_gone and kind is BusGoneError)
-        self._fault = kind(outcome if is_said else f"{reason}; {outcome}")
+        # torque off may have met the same loss
+        is_repeated = reason in outcome or (is_gone and kind is BusGoneError)
+        self._fault = kind(outcome if is_repeated else f"{reason}; {outcome}")
         return self._fault
 
     def _lower(self) -> None:
-        """Let the torque fall within `release_s`, where the limits say so and the servos can."""
+        """Let the torque fall within `release_s`, if that is set and the servos can limit it."""
         if self._guard is not None and self._guard.limits.release_s > 0.0:
-            self._say_busy()
+            self._send_busy()
             self._servos.lower(self._guard.limits.release_s)
 
     def _torque_off(self) -> HardwareError | None:
-        """Torque off at once, then confirmed; returns what is not certain about it."""
+        """Switch torque off at once, then ask for confirmation; return what remains uncertain."""
         self._guard = None
-        return self._servos.torque_off(self._say_busy)
+        return self._servos.torque_off(self._send_busy)
 
-    def _say_busy(self) -> None:
-        """Tell the program that torque off takes its time.
+    def _send_busy(self) -> None:
+        """Announce to the program that torque off takes longer.
 
-        It takes a silent supervisor for dead.
+        The program takes a silent supervisor for dead.
         """
         with contextlib.suppress(OSError):
             self._channel.send({"number": self._number, "busy": True})
 
 
-def require_ready(name: str, condition: Condition, limit_c: float) -> None:
-    """Refuse torque to a servo that reports a hardware error, moves, or is too hot.
-
-    Args:
-        name: Of the servo in messages.
-        condition: Its condition.
-        limit_c: Highest temperature; its own setting holds where that is lower [°C].
-
-    Raises:
-        FaultError: It may not get torque, or its speed or temperature is not known.
-    """
-    if condition.error:
-        cure = "remove the cause, then switch its power off and on"
-        raise FaultError(f"{name} reports {condition.error}; {cure}")
-    speed = abs(condition.velocity)
-    if exceeds(speed, _REST_RAD_S):
-        moves = f"{name} moves at {speed:.2f} rad/s"
-        cure = f"below {_REST_RAD_S:g} rad/s: wait until it hangs still, then try again"
-        raise FaultError(f"{moves}; torque goes on at rest, {cure}")
-    hottest = min(limit_c, condition.temperature_limit)
-    if exceeds(condition.temperature, hottest):
-        which = f"{name}: {condition.temperature:g}"
-        raise FaultError(explain_heat(which, np.array(hottest)))
-
-
 def _end(signal_number: int, _: Any) -> None:
-    """End by an exception, once: a second signal must not keep torque off from being sent."""
+    """End by an exception, once: a second signal must not interrupt torque off."""
     for number in _SIGNALS:
         signal.signal(number, _ignore)
     raise SystemExit(128 + signal_number)
 
 
 def _ignore(signal_number: int, _: Any) -> None:
-    """In the place of SIG_IGN, with which Python complains of a signal that came just before."""
+    """Ignore a signal; with SIG_IGN, Python would complain of one that came just before."""
 
 
 def main(ports: list[str], baudrate: int, protocol: Protocol, channel: Channel) -> None:
-    """Open the ports, say how that went, and serve."""
+    """Open the ports, report success or failure, and serve."""
     program = os.getppid()
     for number in _SIGNALS:
         signal.signal(number, _end)
-    # a thread for each of several buses
+    # each further bus has a thread
     realtime.prefer_realtime(realtime.Priority.SUPERVISOR, with_threads=True)
     buses = [BUSES[protocol](port, baudrate) for port in ports]
     try:
