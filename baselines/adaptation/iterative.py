@@ -53,13 +53,7 @@ import numpy as np
 from typing_extensions import override
 
 from baselines.compensation.measured import LINK_ENCODER
-from baselines.compensation.policy import (
-    MemoryAround,
-    Policy,
-    PolicyAround,
-    PolicyInputs,
-    Step,
-)
+from baselines.compensation.policy import MemoryAround, Policy, PolicyAround, PolicyInputs, Step
 from baselines.compensation.startup import Ramp
 from baselines.walking.mean_zmp import FlatFeet
 from baselines.walking.posture import hip_offsets

@@ -19,11 +19,7 @@ from baselines.compensation.contact_torque import (
     shift_plan,
 )
 from baselines.compensation.dry_friction import FrictionCompensation, FrictionMemory
-from baselines.compensation.gravity_torque import (
-    GravityMethod,
-    GravityModel,
-    make_gravity,
-)
+from baselines.compensation.gravity_torque import GravityMethod, GravityModel, make_gravity
 from baselines.compensation.inputs import DEFLECTION
 from baselines.compensation.policy import (
     Motion,

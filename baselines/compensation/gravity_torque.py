@@ -8,10 +8,7 @@ from typing import Any, Literal, Protocol, get_args
 
 import numpy as np
 
-from baselines.compensation.contact_torque import (
-    ContactGravity,
-    ContactMethod,
-)
+from baselines.compensation.contact_torque import ContactGravity, ContactMethod
 from elastic_env.core.errors import ConfigurationError, require_known
 from elastic_env.core.signals import Array
 from elastic_env.rigid.rigid_body import RigidBody, needs_more_than_gravity

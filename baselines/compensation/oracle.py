@@ -10,11 +10,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from typing_extensions import override
 
-from baselines.compensation.compensators import (
-    Compensated,
-    DriveMemory,
-    DynamicCompensator,
-)
+from baselines.compensation.compensators import Compensated, DriveMemory, DynamicCompensator
 from baselines.compensation.policy import Motion, PassingMemory, Policy, PolicyInputs, Step
 from baselines.compensation.startup import Ramp
 from elastic_env.core.errors import ElasticError

@@ -33,13 +33,7 @@ from baselines.walking.foothold import OF_FEET
 from baselines.walking.mean_zmp import IN_PLANE, LEAST_LOAD, FlatFeet
 from baselines.walking.phase_table import harmonics, stride_angle
 from elastic_env.core.errors import ConfigurationError, unknown_name
-from elastic_env.core.signals import (
-    Array,
-    BoolArray,
-    Signal,
-    SignalGroup,
-    rename_group,
-)
+from elastic_env.core.signals import Array, BoolArray, Signal, SignalGroup, rename_group
 from elastic_env.motion.trajectory import STAND_S
 from elastic_env.world.robot_model import RobotModel, WalkerModel
 

@@ -30,11 +30,7 @@ from typing import Any
 import numpy as np
 from typing_extensions import override
 
-from baselines.compensation.contact_torque import (
-    cosine_and_sine,
-    planned_feet,
-    shifted_shares,
-)
+from baselines.compensation.contact_torque import cosine_and_sine, planned_feet, shifted_shares
 from baselines.compensation.policy import (
     NO_INPUTS,
     ONE_WORLD,
