@@ -9,20 +9,16 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import partial
-from pathlib import Path
 from typing import Any
 
-from baselines.adaptation.disturbance_observer import LINK_IMU, DisturbanceObserver, ObserverGains
+from baselines.adaptation.disturbance_observer import LINK_IMU, DisturbanceObserver
 from baselines.adaptation.estimators import LegEstimator, make_estimator
-from baselines.adaptation.iterative import IterativeLearner, LearningGains, learned_signals
-from baselines.adaptation.online_stiffness import AdaptationGains, OnlineStiffness
-from baselines.compensation.compensators import (
-    Compensated,
-    DynamicCompensator,
-    GravityCompensator,
-    OutputMethod,
-)
-from baselines.compensation.gravity_torque import GravityMethod
+from baselines.adaptation.iterative import IterativeLearner
+from baselines.adaptation.learned_signals import learned_signals
+from baselines.adaptation.online_stiffness import OnlineStiffness
+from baselines.compensation.compensated import Compensated
+from baselines.compensation.compensators import GravityCompensator
+from baselines.compensation.dynamic_compensator import DynamicCompensator
 from baselines.compensation.measured import (
     LINK_ENCODER,
     TORQUE_SENSOR,
@@ -31,89 +27,20 @@ from baselines.compensation.measured import (
 )
 from baselines.compensation.oracle import Oracle, TrueSensors
 from baselines.compensation.policy import Policy, Zero
+from baselines.policy_options import PolicyOptions
 from baselines.walking.controller import WalkingController, WalkingGains
-from baselines.walking.dcm_observer import DcmObserver, DcmObserverGains
-from baselines.walking.foothold import (
-    FootholdCorrection,
-    FootholdGains,
-    FootTare,
-    FootTareGains,
-    RefinedWalk,
-    refine_model,
-)
-from baselines.walking.mean_zmp import StandingEstimate, StandingGains, ZmpOffset, ZmpOffsetGains
+from baselines.walking.dcm_observer import DcmObserver
+from baselines.walking.foot_tare import FootTare
+from baselines.walking.foothold import FootholdCorrection
 from baselines.walking.phase_table import PhaseFeedforward, load_phase_table
 from baselines.walking.posture import PostureFeedback, PostureGains
-from baselines.walking.published import (
-    FootBalance,
-    FootBalanceGains,
-    HipTorque,
-    HipTorqueGains,
-    StanceRoll,
-    StanceRollGains,
-)
-from elastic_env.core.config import Model, quantity
+from baselines.walking.refined_walk import RefinedWalk, refine_model
+from baselines.walking.standing_estimate import StandingEstimate
+from baselines.walking.talos import HipTorque
+from baselines.walking.thormang import FootBalance, StanceRoll
+from baselines.walking.zmp_offset import ZmpOffset, ZmpOffsetGains
 from elastic_env.core.errors import ConfigurationError, require_known
-from elastic_env.motion.trajectory import STAND_S
 from elastic_env.world.robot_model import RobotModel, WalkerModel
-
-
-class PolicyOptions(Model):
-    """Options of the named policies, as keyword arguments of `baselines.make`."""
-
-    stiffness: Any = None
-    """K that the compensator assumes: a number, a list of one per joint [N·m/rad], or the path of
-    an identification; None for the environment's assumed model."""
-    stiffness_scale: float = quantity("1", 1.0, gt=0)
-    """Further factor on the K that is assumed [1]."""
-    output: OutputMethod | None = None
-    """Output compensator: "taylor" for Eq. 12, "newton" for Eq. 10, on the walker also "wrench" and
-    "none"; None for what the policy's name says."""
-    gravity: GravityMethod | None = None
-    """How τ_g is computed: on the testbed "hinge" or "tree", on the walker "com", "ankle" or
-    "lumped"; None for the first of them."""
-    com_feedback: bool = True
-    """Walker: whether the controller feeds the center of mass back."""
-    gains: WalkingGains | None = None
-    """Walker: gains of the controller, over those that the policy's name stands for."""
-    base: str | None = None
-    """Walker: the compensated policy that a feedback builds on; None for `input_output`, and for
-    `dynamic` where `foothold` builds on it."""
-    adaptation: AdaptationGains = AdaptationGains()
-    """How fast the stiffness is adapted."""
-    posture: PostureGains = PostureGains()
-    """Walker: gains of the posture feedback."""
-    zmp_offset: ZmpOffsetGains | None = None
-    """Walker: how the planned ZMP is shifted against the mean error of the measured one; None
-    for not at all, and for `foothold` with its own time constant.
-    """
-    foothold: FootholdGains = FootholdGains()
-    """Walker: how `foothold` corrects where the feet land."""
-    standing: StandingGains = StandingGains()
-    """Walker: how `foothold` estimates the mean ZMP error of a walk from its standing."""
-    foot_tare: FootTareGains = FootTareGains()
-    """Walker: how `foothold` sets the foot sensors to zero."""
-    dcm_observer: DcmObserverGains = DcmObserverGains()
-    """Walker: filters and bound of `disturbance_observer`."""
-    phase_table: Path | None = None
-    """Walker: file of the table of `phase_table`; None for the package's own of the gait."""
-    stance_roll: StanceRollGains = StanceRollGains()
-    """Walker: hip roll feedforward of `thormang`."""
-    foot_balance: FootBalanceGains = FootBalanceGains()
-    """Walker: gains of the stabiliser of `thormang`."""
-    hip_torque: HipTorqueGains = HipTorqueGains()
-    """Walker: filter, bound and rate limit of `talos`."""
-    observer: ObserverGains = ObserverGains()
-    """Testbed: filters and bound of `disturbance_observer`."""
-    learned_base: str | None = None
-    """The policy whose offsets `iterative` learns; None for `adaptive_posture` on the walker,
-    else `input`.
-    """
-    learning: LearningGains = LearningGains()
-    """How `iterative` learns, and from how many trials."""
-    ramp_s: float = quantity("s", STAND_S, gt=0, le=3600)
-    """Time in which the compensation grows from zero [s]."""
-
 
 Builder = Callable[[Any, Any, PolicyOptions], Any]
 """Builds a policy for an environment, an assumed model and options."""
@@ -380,7 +307,6 @@ COMPENSATED: Mapping[str, Builder] = {
     "dynamic": _around(_controller, DynamicCompensator, "wrench"),
 }
 """Compensated policies of a walker, which a feedback can build on."""
-
 ASSUMED_OPTIONS = ("stiffness", "stiffness_scale")
 """Options that say what a policy assumes of the joints."""
 _COMPENSATOR = (*ASSUMED_OPTIONS, "output", "gravity", "ramp_s")
@@ -392,7 +318,6 @@ _FOOTHOLD = ("foothold", "standing", "foot_tare")
 _LEARNED = ("learned_base", "learning")
 _PUBLISHED = ("stance_roll", "foot_balance", "ramp_s")
 _TALOS = (*ASSUMED_OPTIONS, *_CONTROLLER, "hip_torque")
-
 ON_JOINTS: Mapping[str, NamedPolicy] = {
     "zero": NamedPolicy(_zero),
     "uncompensated": NamedPolicy(_zero),
@@ -410,7 +335,6 @@ ON_JOINTS: Mapping[str, NamedPolicy] = {
 
 There `uncompensated` has no controller to add and equals `zero`.
 """
-
 ON_THE_WALKER: Mapping[str, NamedPolicy] = {
     "zero": NamedPolicy(_zero),
     "uncompensated_open": NamedPolicy(_open(_controller), (*ASSUMED_OPTIONS, "gains", "ramp_s")),

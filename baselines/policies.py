@@ -3,7 +3,8 @@
 from pathlib import Path
 from typing import Any
 
-from baselines.adaptation.iterative import LearnedOffsets, learned_signals
+from baselines.adaptation.iterative import LearnedOffsets
+from baselines.adaptation.learned_signals import learned_signals
 from baselines.adaptation.offset_folder import load_table
 from baselines.catalogue import (
     ASSUMED_OPTIONS,
@@ -11,13 +12,14 @@ from baselines.catalogue import (
     BEST_ON_THE_WALKER,
     ON_JOINTS,
     ON_THE_WALKER,
-    PolicyOptions,
     Track,
     policies_of,
 )
 from baselines.compensation.policy import Policy
+from baselines.policy_options import PolicyOptions
 from baselines.residual.correction import Corrected
-from baselines.residual.residual_policy import ResidualPolicy, load_residual
+from baselines.residual.residual_folder import load_residual
+from baselines.residual.residual_policy import ResidualPolicy
 from baselines.residual.settings import RESIDUAL
 from baselines.residual.true_robot import truth_of
 from elastic_env.core.errors import ConfigurationError, shorten, unknown_name

@@ -13,12 +13,10 @@ from safetensors.numpy import save
 
 import baselines
 import elastic_env  # noqa: F401  registers the environments
-from baselines.adaptation.iterative import (
+from baselines.adaptation.iterative import IterativeLearner, Trial
+from baselines.adaptation.learned_signals import LearningGains, WalkSignals
+from baselines.adaptation.learning_law import (
     ChannelGains,
-    IterativeLearner,
-    LearningGains,
-    Trial,
-    WalkSignals,
     lead_error,
     limit_surprise,
     update,

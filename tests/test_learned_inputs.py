@@ -8,13 +8,13 @@ import pytest
 from gymnasium.vector import AutoresetMode
 
 import baselines
-from baselines.compensation.policy import select_rows
+from baselines.compensation.memory import select_rows
 from baselines.residual.correction import Corrected
 from baselines.residual.features import Features
 from baselines.residual.residual_policy import ResidualPolicy
 from baselines.residual.settings import ResidualSettings
 from baselines.residual_env import ResidualVectorWrapper, ResidualWrapper
-from baselines.walking.mean_zmp import LEAST_LOAD, FlatFeet
+from baselines.walking.flat_feet import LEAST_LOAD, FlatFeet
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
 from tests.test_residual import random_network

@@ -10,15 +10,12 @@ import pytest
 import baselines
 import elastic_env  # noqa: F401  registers the environments
 from baselines.policies import Track, sensors_needed, track
-from baselines.walking.published import (
+from baselines.walking.talos import HipTorque, HipTorqueGains, limit_rate, low_pass
+from baselines.walking.thormang import (
     FootBalance,
     FootBalanceGains,
-    HipTorque,
-    HipTorqueGains,
     StanceRoll,
     StanceRollGains,
-    limit_rate,
-    low_pass,
     stance_roll,
 )
 from elastic_env.core.errors import ConfigurationError

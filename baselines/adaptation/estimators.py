@@ -10,8 +10,8 @@ r"""By how much the joints bend more than the model says, r, from what a robot m
 ρ is the relative error of a leg's compliance by `BendingObserver`, μ the mean excess load of the
 feet. Without torque sensors ρ of pitch is left out: friction hides the bending there. Joints
 without a link encoder have r_j = 0. r_j is by the regression below. The expected deflection is
-:math:`h = K^{-1} (\tau + \tau_F)` with the Coulomb friction, and with the torque of the measured foot wrenches, or of the
-motion on a fixed base.
+:math:`h = K^{-1} (\tau + \tau_F)` with the Coulomb friction, and with the torque of the measured
+foot wrenches, or of the motion on a fixed base.
 
 **Regression.** The Coulomb friction :math:`\tau_F` turns round over a short displacement of the
 link [Dahl1968]. Sensors show
@@ -38,7 +38,7 @@ from baselines.compensation.compensators import GravityCompensator
 from baselines.compensation.dry_friction import presliding_friction
 from baselines.compensation.gravity_torque import make_gravity
 from baselines.compensation.measured import DeflectionSensors
-from baselines.compensation.policy import ObservationView
+from baselines.compensation.observation_view import ObservationView
 from baselines.estimation.bending import BendingObserver
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array, SignalTable

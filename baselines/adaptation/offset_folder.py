@@ -12,7 +12,7 @@ import numpy as np
 from pydantic import AfterValidator, Field
 from safetensors.numpy import save
 
-from baselines.adaptation.iterative import LearningGains
+from baselines.adaptation.learned_signals import LearningGains
 from elastic_env.core.config import MOST_ENTRIES, Model, Title, load_json, quantity
 from elastic_env.core.errors import ConfigurationError, quote
 from elastic_env.core.files import write_whole

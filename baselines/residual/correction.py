@@ -14,6 +14,7 @@ import numpy as np
 
 from baselines.compensation import inputs as named_inputs
 from baselines.compensation.inputs import COMMAND, INPUTS, InputKind
+from baselines.compensation.memory import resume_memory
 from baselines.compensation.policy import (
     NO_INPUTS,
     ONE_WORLD,
@@ -21,7 +22,6 @@ from baselines.compensation.policy import (
     Step,
     as_action,
     as_batch_policy,
-    resume_memory,
 )
 from baselines.residual.settings import ResidualSettings
 from elastic_env.core.errors import ConfigurationError, unknown_name

@@ -23,15 +23,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from baselines.compensation.policy import ObservationView, put_rows, select_rows
+from baselines.compensation.memory import put_rows, select_rows
+from baselines.compensation.observation_view import ObservationView
 from baselines.estimation.bending import BendingObserver
 from baselines.estimation.ground_level import GroundLevel, GroundMemory
 from baselines.residual.correction import Corrected
 from baselines.residual.mirror import LeftFirst
 from baselines.residual.true_robot import true_robot
+from baselines.walking.flat_feet import LEAST_LOAD, FlatFeet
 from baselines.walking.foothold import OF_FEET
-from baselines.walking.mean_zmp import IN_PLANE, LEAST_LOAD, FlatFeet
 from baselines.walking.phase_table import harmonics, stride_angle
+from baselines.walking.zmp_offset import IN_PLANE
 from elastic_env.core.errors import ConfigurationError, unknown_name
 from elastic_env.core.signals import Array, BoolArray, Signal, SignalGroup, rename_group
 from elastic_env.motion.trajectory import STAND_S
