@@ -375,7 +375,7 @@ def test_damaged_files_say_what_is_wrong(run: Path, tmp_path: Path) -> None:
     assert "cannot be read" in problem(offsets=(run / OFFSETS).read_bytes()[:-8])
     assert "must be a baseline" in problem(lambda content: content.update(base="residual:x"))
     assert "describes no table" in problem(lambda content: content.update(colour="red"))
-    with pytest.raises(ConfigurationError, match="nothing learned lies at"):
+    with pytest.raises(ConfigurationError, match="no learned offsets at"):
         baselines.make(f"iterative:{tmp_path / 'nowhere'}", env)
 
 

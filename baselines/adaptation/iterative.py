@@ -1,47 +1,9 @@
-r"""A policy whose offsets are learned from trial to trial on the robot itself.
+"""Policies whose offsets are learned from trial to trial on the robot itself.
 
-It needs no simulation, no model beside that of its base, and no truth: the trials are episodes of
-the environment that it is given, which may be hardware. What it has learned is a table of offsets
-over the time of an episode.
-
-The errors of a trial correct the offsets of the next one by iterative learning control:
-
-.. math:: u_{j+1}(t) = Q \, [\, (1 - \lambda) \, u_j(t) + \gamma \, e_j(t + \ell) \,]
-
-u is a table of offsets over the time of a trial and e the error that the sensors showed in trial j.
-γ is the learning gain. It may fall as 1 / (1 + j/n), which averages the noise of later trials
-[Saab2001]. A share λ is forgotten, so that noise does not add up where the plant hardly answers.
-The lead ℓ makes up for the delay from an offset to its effect. Q is a low-pass filter without phase
-shift, which stops learning where the delay is not known well enough [Longman2000, Elci2002]. With a
-plant e = d − P u the error shrinks from trial to trial where, at all frequencies,
-
-.. math:: | Q \, (1 - \lambda - \gamma \, e^{i \omega \ell} P) | < 1
-
-[Bristow2006]; the wrong sign of γ diverges. With Q = 1, λ = 0 and P = p it is e_j = (1 − γ p)^j
-e_0.
-
-A push in one trial is no error of the robot. So an error may shrink by any amount from one trial to
-the next, but it counts as grown, or as turned over, by no more than a surprise.
-
-[Bristow2006] D. A. Bristow, M. Tharayil, A. G. Alleyne, "A Survey of Iterative Learning Control",
-IEEE Control Systems Magazine 26(3). [Longman2000] R. W. Longman, "Iterative Learning Control and
-Repetitive Control for Engineering Practice", International Journal of Control 73(10). [Saab2001] S.
-S. Saab, "A Discrete-Time Stochastic Learning Control Algorithm", IEEE Trans. Automatic Control
-46(6). [Elci2002] H. Elci, R. W. Longman, M. Q. Phan, J.-N. Juang, R. Ugoletti, "Simple Learning
-Control Made Practical by Zero-Phase Filtering: Applications to Robotics", IEEE Trans. Circuits and
-Systems I 49(6).
-
-Signals are learned from trial to trial: errors, and the offsets that correct them.
-
-| robot | error, by sensors alone | correction |
-|---|---|---|
-| walker | roll and pitch of the IMU | the same offset on both hip rolls, or on both hip pitches |
-| walker | planned less measured ZMP | another ZMP of the plan, see `baselines.walking.zmp_shift` |
-| joints | q_ref − q by link encoders, or by the IMU of the only link | the offset of the joint |
-
-A positive offset of both hip rolls turns the pelvis to a negative roll, so the error is the roll
-itself. The ZMP and the links follow their offsets, so their error is what was asked less what was
-measured.
+Learning needs no simulation, no model except that of the base, and no truth. The trials are
+episodes of the given environment, which may be hardware. The result is a table of offsets over the
+time of an episode. `baselines.adaptation.learning_law` has the equation, and
+`baselines.adaptation.learned_signals` the errors and offsets.
 """
 
 from collections.abc import Mapping, Sequence
@@ -59,21 +21,21 @@ from elastic_env.core.errors import ElasticError
 from elastic_env.core.signals import Array, BoolArray
 from elastic_env.world.robot_model import RobotModel
 
-_RETREAT = 0.5
-"""Share of the offsets that is kept after a trial that failed, such as by a fall."""
+_SHARE_AFTER_FAILURE = 0.5
+"""Share of the offsets that remains after a failed trial, such as a fall."""
 
 
 class LearnedOffsets(PolicyAround):
     """Any policy with a table of offsets added, row by row from the start of an episode.
 
     Args:
-        policy: What commands the robot.
+        policy: Commands the robot.
         model: Assumed robot.
-        signals: What the columns of the table are.
+        signals: Signals of the columns of the table.
         ramp_s: Time in which the offsets grow from zero [s].
 
     Attributes:
-        tables: What was learned, for every world or for all of them alike, (num_worlds or 1, T, k).
+        tables: Learned offsets, one table per world or one for all, (num_worlds or 1, T, k).
     """
 
     memory_type = np.int64
@@ -91,11 +53,11 @@ class LearnedOffsets(PolicyAround):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the columns, with their unit."""
+        """Names of the columns, with their unit."""
         return self._signals.names
 
     def play(self, tables: Array) -> None:
-        """Take other offsets, (num_worlds or 1, T, k).
+        """Use other offsets, (num_worlds or 1, T, k).
 
         Row t acts in the period that ends t periods after the start.
         """
@@ -106,13 +68,15 @@ class LearnedOffsets(PolicyAround):
 
     @override
     def act(self, rows: Array, memory: MemoryAround, inputs: PolicyInputs) -> Step:
-        """After the last row of the table its offsets stay."""
+        """Act with the offsets of this control step; after the last row they stay."""
         action, inner = self.policy.act(rows, memory.inner, inputs)
         steps = memory.own + 1
         tables = len(self._offsets)
         if tables not in (1, len(rows)):
-            learned = f"learned in {tables} worlds, one each"
-            raise ElasticError(f"the offsets were {learned}, and are played in {len(rows)}")
+            raise ElasticError(
+                f"the offsets were learned in {tables} worlds, one each, and are played in"
+                f" {len(rows)}"
+            )
         row = np.minimum(steps, self._offsets.shape[1] - 1)
         offsets = self._offsets[np.arange(len(rows)) if tables > 1 else 0, row]
         return (action + offsets).astype(np.float32), MemoryAround(steps, inner)
@@ -123,10 +87,10 @@ class Trial:
     """Result of a trial.
 
     Attributes:
-        number: Of the trial, 0 for the first, which has no offsets yet.
+        number: Number of the trial, 0 for the first, which has no offsets yet.
         error: Measured errors, (num_worlds, T, k); nan where there is none.
         failed: Worlds whose trial ended before its time, (num_worlds,).
-        metrics: Metrics of every world's episode, for people: nothing is learned of them.
+        metrics: Metrics of every world's episode, for people; learning does not use them.
     """
 
     number: int
@@ -141,58 +105,58 @@ class Trial:
 
 
 class IterativeLearner(LearnedOffsets):
-    """`LearnedOffsets` that learns them before it is scored; each world learns on its own robot.
+    """`LearnedOffsets` that are learned before scoring; each world learns on its own robot.
 
     Args:
-        policy: What commands the robot.
+        policy: Commands the robot.
         model: Assumed robot.
-        signals: Errors, offsets, gains.
+        signals: Errors, offsets and gains.
         ramp_s: Time in which the offsets grow from zero [s].
     """
 
     trials = 10
     """Number of trials that it learns from."""
 
-    def rehearse(self, env: Any, seed: int, told: Any = None) -> None:
-        """Learn on the robots that `env.reset(seed=seed)` draws; earlier learning is dropped.
+    def rehearse(self, env: Any, seed: int, report: Any = None) -> None:
+        """Learn on the robots that `env.reset(seed=seed)` draws, from the beginning.
 
         Args:
             env: The environment that the policy was made for, scalar or vector.
             seed: World i has the robot of seed + i, in every trial with other noise.
-            told: Called with each `Trial`.
+            report: Called with each `Trial`.
         """
-        stage = Stage(env, seed)
-        shape = (stage.num_worlds, stage.num_steps + 1, len(self.names))
+        trials = Trials(env, seed)
+        shape = (trials.num_worlds, trials.num_steps + 1, len(self.names))
         tables = np.zeros(shape)
         before = np.full(shape, np.inf)
         for number in range(self.trials):
             self.play(tables)
-            trial = stage.trial(self, self._signals, number)
+            trial = trials.play(self, self._signals, number)
             tables, before = self._learn(tables, before, trial)
-            if told is not None:
-                told(trial)
+            if report is not None:
+                report(trial)
         self.play(tables)
 
     def _learn(self, tables: Array, before: Array, trial: Trial) -> tuple[Array, Array]:
-        """Tables of the next trial, and what was credible of the errors."""
+        """Tables of the next trial, and the limited errors of this one."""
         gains = self._signals.gains
-        surprise = np.array([own.surprise for own in gains])
-        # where nothing came before, all is credible
-        known = np.where(np.isfinite(before), before, np.nan_to_num(trial.error))
-        errors = limit_surprise(trial.error, known, surprise)
-        following = np.empty_like(tables)
+        surprise = np.array([channel.surprise for channel in gains])
+        # the first error of a world has no limit
+        last = np.where(np.isfinite(before), before, np.nan_to_num(trial.error))
+        errors = limit_surprise(trial.error, last, surprise)
+        next_tables = np.empty_like(tables)
         for world, table in enumerate(tables):
-            following[world] = update(table, errors[world], gains, self._period_s, trial.number)
+            next_tables[world] = update(table, errors[world], gains, self._period_s, trial.number)
         failed = trial.failed[:, None, None]
-        tables = np.where(failed, _RETREAT * tables, following)
+        tables = np.where(failed, _SHARE_AFTER_FAILURE * tables, next_tables)
         return tables, np.where(failed, before, errors)
 
 
-class Stage:
-    """An environment in which the same robots do trial after trial.
+class Trials:
+    """Trials of the same robots, one after another.
 
     Args:
-        env: It, scalar or vector.
+        env: The environment, scalar or vector.
         seed: World i has the robot of seed + i.
     """
 
@@ -204,20 +168,20 @@ class Stage:
         self.num_steps: int = env.unwrapped.task.num_steps
         self._robots = [seed + world for world in range(self.num_worlds)]
 
-    def trial(self, policy: Policy, signals: LearnedSignals, number: int) -> Trial:
+    def play(self, policy: Policy, signals: LearnedSignals, number: int) -> Trial:
         """Play an episode in every world.
 
-        Its noise depends on the robot's seed and the number of the trial alone.
+        Its noise depends on the robot's seed and the number of the trial only.
         """
         n = self.num_worlds
         is_scalar = self._is_scalar
-        seeds: Any = [_seed_of_noise(robot, number) for robot in self._robots]
+        seeds: Any = [_noise_seed(robot, number) for robot in self._robots]
         robots: Any = self._robots
         if is_scalar:
             seeds = seeds[0]
             robots = robots[0]
-        seen, _ = self._env.reset(seed=seeds, options={"robot_seed": robots})
-        seen = np.atleast_2d(seen)
+        after, _ = self._env.reset(seed=seeds, options={"robot_seed": robots})
+        after = np.atleast_2d(after)
         error = np.full((n, self.num_steps + 1, len(signals.names)), np.nan)
         over = np.zeros(n, dtype=np.bool_)
         failed = np.zeros(n, dtype=np.bool_)
@@ -225,19 +189,18 @@ class Stage:
         state = None
         start = np.ones(n, dtype=np.bool_)
         for step in range(1, self.num_steps + 1):
-            action, state = policy.predict(seen, state, start, deterministic=True)
-            asked = seen
+            before = after
+            action, state = policy.predict(before, state, start, deterministic=True)
             command = action[0] if is_scalar else action
-            seen, _, terminated, truncated, info = self._env.step(command)
-            seen = np.atleast_2d(seen)
+            after, _, terminated, truncated, info = self._env.step(command)
+            after = np.atleast_2d(after)
             terminated = np.atleast_1d(terminated)
             start = terminated | truncated
-            running = ~over & ~terminated
-            error[running, step] = signals.error(asked, seen, info)[running]
+            is_running = ~over & ~terminated
+            error[is_running, step] = signals.error(before, after, info)[is_running]
             for world in np.flatnonzero(start & ~over).tolist():
-                found = info.get("final_info", info)["episode_metrics"].items()
-                own = {k: v if is_scalar else v[world] for k, v in found}
-                metrics[world] = {name: float(value) for name, value in own.items()}
+                values = info.get("final_info", info)["episode_metrics"].items()
+                metrics[world] = {k: float(v if is_scalar else v[world]) for k, v in values}
             failed = failed | (terminated & ~over)
             over = over | start
             if over.all():
@@ -245,7 +208,7 @@ class Stage:
         return Trial(number, error, failed, metrics)
 
 
-def _seed_of_noise(robot: int, number: int) -> int:
-    """Seed of a trial's noise, unlike that of any other trial and of the robot's own episode."""
+def _noise_seed(robot: int, number: int) -> int:
+    """Seed of a trial's noise, different for every trial, and from the seed of the robot."""
     sequence = np.random.SeedSequence([robot, number])
     return int(sequence.generate_state(1, np.uint64)[0] >> 1)

@@ -1,4 +1,15 @@
-r"""TODO signals"""
+"""Signals that `iterative` learns: errors, and the offsets that correct them.
+
+| robot | error, by sensors alone | correction |
+|---|---|---|
+| walker | roll and pitch of the IMU | the same offset on both hip rolls, or on both hip pitches |
+| walker | planned less measured ZMP | another ZMP of the plan, see `baselines.walking.zmp_shift` |
+| joints | q_ref − q by link encoders, or by the IMU of the only link | the offset of the joint |
+
+A positive offset of both hip rolls turns the pelvis to a negative roll, so the error is the roll
+itself. The ZMP and the links follow their offsets, so their error is the desired value less the
+measured one.
+"""
 
 from abc import abstractmethod
 from collections.abc import Mapping
@@ -17,14 +28,16 @@ from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
 from elastic_env.world.robot_model import RobotModel, WalkerModel
 
-LINK_IMU = "link_angle_imu"
-_LEAST_LOAD = 0.15  # share of the weight below which there is no ZMP
+_LINK_ANGLE = "link_angle_imu"
+"""Measured angle of the only link, in the info of a step."""
+_LEAST_LOAD = 0.15
+"""Share of the weight below which there is no ZMP."""
 _ZMP = ChannelGains(gain=0.6, lead_s=0.26, cutoff_hz=2.0, surprise=0.006, limit=0.06)
 _ZMP = _ZMP.replace(forgetting=0.1, halved_after=3.0)
 
 
 class LearningGains(Model):
-    """How the offsets of `iterative` are learned."""
+    """Gains with which `iterative` learns, and the number of its trials."""
 
     trials: int = quantity("1", 10, ge=1, le=1000)
     """Trials, such as walks, that it learns from [1]."""
@@ -43,22 +56,21 @@ class LearningGains(Model):
 
 
 class LearnedSignals(Protocol):
-    """Errors that are corrected, and how."""
+    """Errors, and the offsets that correct them."""
 
     names: tuple[str, ...]
-    """Of the columns, with their unit."""
+    """Names of the columns, with their unit."""
     gains: tuple[ChannelGains, ...]
-    """Of the columns."""
+    """Gains of the columns."""
 
     @abstractmethod
-    def error(self, asked: Array, seen: Array, info: Mapping[str, Any]) -> Array:
+    def error(self, before: Array, after: Array, info: Mapping[str, Any]) -> Array:
         """Errors measured after a control step, (num_worlds, k); nan where nothing was measured.
 
         Args:
-            asked: Observations before the step, whose reference is that of its end, (num_worlds,
-                m).
-            seen: Observations after it.
-            info: What the environment says of it.
+            before: Observations before the step, with the reference for its end, (num_worlds, m).
+            after: Observations after it, (num_worlds, m).
+            info: Info that the environment returned with it.
         """
 
     @abstractmethod
@@ -71,7 +83,7 @@ class WalkSignals(LearnedSignals):
 
     Args:
         model: Assumed walker.
-        gains: How they are learned.
+        gains: Gains of the channels.
     """
 
     names: tuple[str, ...] = ("roll_rad", "pitch_rad", "zmp_x_m", "zmp_y_m")
@@ -85,10 +97,10 @@ class WalkSignals(LearnedSignals):
         self._wrench = table.group("wrench")
 
     @override
-    def error(self, asked: Array, seen: Array, info: Mapping[str, Any]) -> Array:
+    def error(self, before: Array, after: Array, info: Mapping[str, Any]) -> Array:
         """Tilt, and error of the ZMP of feet that are flat where planned, (num_worlds, 4)."""
-        error = self._feet.zmp_error(asked, seen[:, self._wrench])
-        return np.hstack([seen[:, self._attitude], -error])
+        error = self._feet.zmp_error(before, after[:, self._wrench])
+        return np.hstack([after[:, self._attitude], -error])
 
     @override
     def offsets(self, table: Array) -> Array:
@@ -100,10 +112,10 @@ class JointSignals(LearnedSignals):
 
     Args:
         model: Assumed robot.
-        gains: How they are learned.
+        gains: Gains of the channels.
 
     Raises:
-        ConfigurationError: Nothing shows its links.
+        ConfigurationError: No sensor measures its links.
     """
 
     def __init__(self, model: RobotModel, gains: LearningGains) -> None:
@@ -121,10 +133,10 @@ class JointSignals(LearnedSignals):
             )
 
     @override
-    def error(self, asked: Array, seen: Array, info: Mapping[str, Any]) -> Array:
+    def error(self, before: Array, after: Array, info: Mapping[str, Any]) -> Array:
         by_imu = self._encoder is None
-        link = np.reshape(info[LINK_IMU], (-1, 1)) if by_imu else seen[:, self._encoder]
-        return asked[:, self._reference] - link
+        link = np.reshape(info[_LINK_ANGLE], (-1, 1)) if by_imu else after[:, self._encoder]
+        return before[:, self._reference] - link
 
     @override
     def offsets(self, table: Array) -> Array:
@@ -132,7 +144,7 @@ class JointSignals(LearnedSignals):
 
 
 def learned_signals(model: RobotModel, gains: LearningGains) -> LearnedSignals:
-    """Signals that are learned of a robot."""
+    """Make the signals that `iterative` learns for a robot."""
     if isinstance(model, WalkerModel):
         return WalkSignals(model, gains)
     return JointSignals(model, gains)

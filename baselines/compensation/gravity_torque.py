@@ -103,7 +103,8 @@ def largest_gravity_torque(body: RigidBody, lowest: Array, highest: Array) -> Ar
 
     Args:
         body: The robot.
-        lowest, highest: Joint ranges, infinite without one, (n,) each [rad].
+        lowest: Lower ends of the joint ranges, infinite without one, (n,) [rad].
+        highest: Upper ends, likewise.
     """
     lowest = np.where(np.isfinite(lowest), lowest, -np.pi)
     highest = np.where(np.isfinite(highest), highest, np.pi)

@@ -15,21 +15,21 @@ Single = npt.NDArray[np.float32]
 Tensors = Mapping[str, npt.NDArray[Any]]
 """`mean` and `std` of the features, `weight0`, `bias0`, `weight1`, ..."""
 _ACTIVATIONS = {"tanh": np.tanh, "relu": lambda x: np.maximum(x, np.float32(0.0))}
-_MOST_LAYERS = 10
-_LARGEST = 1e6
+_MAX_LAYERS = 10
+_LARGEST_WEIGHT = 1e6
 _TYPES = ("float32", "float64")
 
 
 def require_network(tensors: Tensors) -> int:
-    """The number of layers of tensors that make a network.
+    """Check the tensors of a network, and return its number of layers.
 
     Raises:
         ConfigurationError: Tensors that are missing, have a wrong shape or type, or are not finite.
     """
     depth = sum(name.startswith("weight") for name in tensors)
     names = {f"{kind}{i}" for kind in ("weight", "bias") for i in range(depth)}
-    if not 1 <= depth <= _MOST_LAYERS or set(tensors) != {"mean", "std", *names}:
-        needed = f"mean, std, weight0, bias0, ... of at most {_MOST_LAYERS} layers"
+    if not 1 <= depth <= _MAX_LAYERS or set(tensors) != {"mean", "std", *names}:
+        needed = f"mean, std, weight0, bias0, ... of at most {_MAX_LAYERS} layers"
         raise ConfigurationError(f"weights must be {needed}; got {quote(sorted(tensors))}")
     for name, tensor in tensors.items():
         _require_numbers(name, tensor)
@@ -42,10 +42,9 @@ def require_network(tensors: Tensors) -> int:
     widths = [len(tensors[name]) for name in vectors]
     for i in range(depth):
         shape = (widths[i + 1], widths[i])
-        found = tensors[f"weight{i}"].shape
-        if found != shape:
-            shapes = f"the shape {shape}, got {found}"
-            raise ConfigurationError(f"weight{i} must have {shapes}")
+        got = tensors[f"weight{i}"].shape
+        if got != shape:
+            raise ConfigurationError(f"weight{i} must have the shape {shape}, got {got}")
     std = tensors["std"]
     if std.shape != (widths[0],) or not (std > 0.0).all():
         raise ConfigurationError(f"std must be {widths[0]} positive values, one per action")
@@ -56,17 +55,17 @@ def _require_numbers(name: str, tensor: npt.NDArray[Any]) -> None:
     if tensor.dtype not in _TYPES:
         types = " or ".join(_TYPES)
         raise ConfigurationError(f"{name} must be of type {types}, got {tensor.dtype}")
-    largest = np.inf if name in ("mean", "std") else _LARGEST
+    largest = np.inf if name in ("mean", "std") else _LARGEST_WEIGHT
     if not np.isfinite(tensor).all() or (np.abs(tensor) > largest).any():
-        bound = f"weights and biases within ±{_LARGEST:g}"
+        bound = f"weights and biases within ±{_LARGEST_WEIGHT:g}"
         raise ConfigurationError(f"{name} must be finite, {bound}")
 
 
 class Network:
-    """Feed-forward network in single precision: the mean action of normalised features.
+    """Feed-forward network in single precision: the mean action for normalised features.
 
-    A row of a batch is what it is alone, bit for bit, which matrix products of BLAS do not grant.
-    They would also keep threads in the way of the physics.
+    A row has the same bits alone and in a batch, which matrix products of BLAS do not guarantee.
+    Their threads would also slow the physics down.
 
     Args:
         settings: Description of the residual, with activation, output and clipping.
@@ -112,15 +111,15 @@ class Network:
 
 @compiled
 def affine(rows: Single, W: Single, b: Single) -> Single:
-    """Give x W + b of every row x, in single precision, (n, k) to (n, m).
+    """Compute x W + b for every row x, in single precision, (n, k) to (n, m).
 
-    All rows are added up in the same order.
+    The order of the sums is the same for all rows.
     """
     out = np.empty((len(rows), len(b)), dtype=np.float32)
     for row in range(len(rows)):
         for j in range(len(b)):
             out[row, j] = b[j]
-        # along the outputs, whose sums are apart, the processor works on several at once
+        # outputs in the inner loop: their sums are independent, so that it is vectorised
         for i in range(W.shape[0]):
             x = rows[row, i]
             for j in range(len(b)):

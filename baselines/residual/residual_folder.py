@@ -1,4 +1,8 @@
-"""TODO folder"""
+"""Folder of a trained residual: `residual.json` and `weights.safetensors`.
+
+`residual.json` has the base, the settings, the network and the training. Loading runs no code from
+the folder and needs no torch.
+"""
 
 from functools import partial
 from hashlib import sha256
@@ -28,7 +32,7 @@ def save_residual(folder: Path, residual: Any, tensors: Tensors) -> None:
     """
     Network(residual, tensors)
     folder.mkdir(parents=True, exist_ok=True)
-    weights = save({name: np.ascontiguousarray(own) for name, own in tensors.items()})
+    weights = save({name: np.ascontiguousarray(tensor) for name, tensor in tensors.items()})
     write_whole(folder / WEIGHTS, weights)
     residual = residual.replace(weights_sha256=sha256(weights).hexdigest())
     write_whole(folder / DESCRIPTION, residual.model_dump_json(indent=2) + "\n")
@@ -41,42 +45,41 @@ def shipped_names() -> list[str]:
 
 
 def find_folder(folder: Path) -> Path:
-    """A residual's folder: the path itself, or the one of that name in the package."""
-    own = _SHIPPED / folder
+    """Folder of a residual: the path itself, or the folder of that name in the package."""
+    shipped = _SHIPPED / folder
     try:
-        return own if not folder.exists() and own.exists() else folder
+        return shipped if not folder.exists() and shipped.exists() else folder
     except OSError:  # too long for a path, or within a folder that cannot be read
         return folder
 
 
 def read_description(folder: Path) -> ResidualDescription:
-    """Description of a residual; `folder` is a path or the name of a shipped one.
+    """Read the description of a residual; `folder` is a path or the name of a shipped one.
 
     Raises:
         ConfigurationError: There is none, or it is not valid.
     """
     folder = find_folder(folder)
     file = folder / DESCRIPTION
-    missing = partial(_none_at, folder)
+    missing = partial(_missing_residual, folder)
     return load_json(file, ResidualDescription, "residual", missing, within=folder)
 
 
-def _none_at(folder: Path, why: str) -> str:
-    """Sentence that says what to do where no residual is."""
+def _missing_residual(folder: Path, why: str) -> str:
+    """Error message for a folder without a residual."""
     try:
         inside = [*folder.glob(f"*/{DESCRIPTION}"), *folder.glob(f"*/*/{DESCRIPTION}")]
     except OSError:  # a name that is too long, or a folder that cannot be read
         inside = []
-    if inside:  # the last policy first: the best one flatters itself
+    if inside:  # the last policy first: the score of the best one is biased
         folders = sorted((path.parent.name != "last", path.parent) for path in inside)
         listed = ", ".join(str(path) for _, path in folders)
-        cure = f"give one of them: {listed}"
-        return f"{folder} is no residual but has some inside; {cure}"
+        return f"{folder} is no residual but has some inside; give one of them: {listed}"
     families: dict[str, list[str]] = {}
     for name in shipped_names():
         family, _, seed = name.partition("/")
         families.setdefault(family, []).append(seed)
-    names = ", ".join(f"{name}/{own[0]} to {own[-1]}" for name, own in families.items())
+    names = ", ".join(f"{name}/{seeds[0]} to {seeds[-1]}" for name, seeds in families.items())
     return (
         f"no residual at {quote(str(folder))[1:-1]}: a folder with {DESCRIPTION} and {WEIGHTS} is"
         f" needed ({why}), or the name of one that comes with the package: {names}"
@@ -84,7 +87,7 @@ def _none_at(folder: Path, why: str) -> str:
 
 
 def load_residual(folder: Path) -> tuple[ResidualDescription, Network]:
-    """A residual from its folder.
+    """Read a residual from its folder.
 
     Raises:
         ConfigurationError: There is none, or it is damaged.
@@ -97,11 +100,11 @@ def load_residual(folder: Path) -> tuple[ResidualDescription, Network]:
     except ConfigurationError as error:
         file = shorten(folder / WEIGHTS)
         raise ConfigurationError(f"{file} holds no network: {error}") from None
-    found = sha256(content).hexdigest()
-    if description.weights_sha256 not in (None, found):
+    digest = sha256(content).hexdigest()
+    if description.weights_sha256 not in (None, digest):
         raise ConfigurationError(
             f"{folder / WEIGHTS} was changed: {DESCRIPTION} names the SHA-256 digest"
-            f" {description.weights_sha256}, it has {found}; copy it anew, or leave weights_sha256"
+            f" {description.weights_sha256}, it has {digest}; copy it again, or leave weights_sha256"
             " out if you mean these weights"
         )
     return description, network

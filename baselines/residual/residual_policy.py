@@ -1,8 +1,6 @@
-r"""Trained residuals as policies: a network from a folder corrects the base it belongs to.
+"""Trained residuals as policies: a network corrects the base that it belongs to.
 
-A folder holds `residual.json` (base, settings, network, how it was trained) and
-`weights.safetensors`. Loading it runs no code from it and needs no torch. The observation is
-normalised in here; the base policy sees it as it is.
+The policy normalises the observation for the network only: the base sees it as it is.
 """
 
 from typing import Any, NamedTuple
@@ -10,7 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from typing_extensions import override
 
-from baselines.compensation import policy as policies
+from baselines.compensation.memory import put_rows, select_rows
+from baselines.compensation.policy import BatchPolicy, PolicyInputs, Step
 from baselines.residual.correction import Corrected, CorrectedMemory
 from baselines.residual.features import Features, FeaturesMemory
 from baselines.residual.network import Network
@@ -23,7 +22,7 @@ class ResidualMemory(NamedTuple):
 
     Attributes:
         wait: Control steps until the next decision, (num_worlds,); -1 before the first.
-        residual: What was decided, (num_worlds, k).
+        residual: Residual of the last decision, (num_worlds, k).
         features: Memory of the features.
         inner: Memory of the corrected base.
     """
@@ -34,15 +33,15 @@ class ResidualMemory(NamedTuple):
     inner: CorrectedMemory
 
 
-class ResidualPolicy(policies.BatchPolicy):
+class ResidualPolicy(BatchPolicy):
     """A base policy with a network that corrects it.
 
     Args:
         corrected: The base and its correction.
-        network: What decides.
+        network: Decides the residual.
 
     Attributes:
-        features: What the network sees.
+        features: Features for the network.
 
     Raises:
         ConfigurationError: The network does not fit the settings, or they do not fit the robot.
@@ -66,17 +65,16 @@ class ResidualPolicy(policies.BatchPolicy):
         n = len(rows)
         wait = np.full(n, _UNDECIDED)
         residual = np.zeros((n, self.corrected.num_residuals))
-        seen = self.features.begin(n)
-        return ResidualMemory(wait, residual, seen, self.corrected.begin(rows))
+        features = self.features.begin(n)
+        return ResidualMemory(wait, residual, features, self.corrected.begin(rows))
 
     @override
-    def act(self, rows: Array, memory: ResidualMemory, inputs: Any) -> policies.Step:
+    def act(self, rows: Array, memory: ResidualMemory, inputs: PolicyInputs) -> Step:
         due = memory.wait <= 0
         if np.count_nonzero(due) > 0:
-            decided = policies.select_rows(self._decide(rows, memory, due), due)
-            memory = policies.put_rows(memory, due, decided)
-        residual = memory.residual
-        action, inner = self.corrected.correct(rows, residual, memory.inner, inputs)
+            decision = select_rows(self._decide(rows, memory, due), due)
+            memory = put_rows(memory, due, decision)
+        action, inner = self.corrected.correct(rows, memory.residual, memory.inner, inputs)
         return action, memory._replace(wait=memory.wait - 1, inner=inner)
 
     @override
@@ -84,14 +82,13 @@ class ResidualPolicy(policies.BatchPolicy):
         return self.corrected.base.link_angles(rows, memory.inner.inner)
 
     def _decide(self, rows: Array, memory: ResidualMemory, due: BoolArray) -> Any:
-        """Memory after a decision, of the worlds that are due."""
-        inner = memory.inner
-        fresh = memory.wait == _UNDECIDED
-        seen, features = self.features.at(rows, memory.features, fresh, inner, None)
+        """Memory after a decision of the worlds that are due."""
+        is_first = memory.wait == _UNDECIDED
+        values, features = self.features.at(rows, memory.features, is_first, memory.inner, None)
         residual = memory.residual.copy()
-        residual[due] = self.features.turn_back(rows[due], self._network(seen[due]))
+        residual[due] = self.features.turn_back(rows[due], self._network(values[due]))
         wait = np.full_like(memory.wait, self._period)
-        return ResidualMemory(wait, residual, features, inner)
+        return ResidualMemory(wait, residual, features, memory.inner)
 
 
 _UNDECIDED = -1

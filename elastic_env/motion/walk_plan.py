@@ -6,7 +6,7 @@ center of mass of the whole robot, not the pelvis, follows the preview control.
 Legs that swing move the ZMP off that of the cart-table, by 2.5 mm rms in steps of 3 s and by 9 mm
 in steps of 1.1 s. The error of the motion's ZMP can pass the preview control once more
 [Kajita2003], which leaves about a seventh of it. Where the robot does not walk in place, the plan
-is that. A policy can walk a plan that is refined once more (`baselines.walking.foothold`).
+is that. A policy can walk a plan that is refined once more (`baselines.walking.refined_walk`).
 
 The plan's world frame: x forward at the start, y left, z up, the origin on the ground halfway
 between the feet at the start. The local frame, in which policies read the plan: level, on the

@@ -11,7 +11,7 @@ from pydantic import model_validator
 from rich.console import Console
 from rich.table import Table
 
-from baselines.adaptation.iterative import IterativeLearner, Stage, Trial
+from baselines.adaptation.iterative import IterativeLearner, Trial, Trials
 from baselines.adaptation.learned_signals import LearningGains, learned_signals
 from baselines.adaptation.offset_folder import TableDescription, motion_of, save_table
 from baselines.catalogue import learned_base
@@ -136,7 +136,7 @@ class Iterate(Model):
 
             policy.rehearse(env, self.seed, keep)
             signals = learned_signals(env.unwrapped.assumed_model, self.gains)
-            keep(Stage(env, self.seed).trial(policy, signals, policy.trials))
+            keep(Trials(env, self.seed).play(policy, signals, policy.trials))
         return trials
 
     def _write(self, trials: Sequence[Trial], names: Sequence[str], path: Path) -> Path:
