@@ -28,38 +28,37 @@ class PolicyOptions(Model):
     """K that the compensator assumes: a number, a list of one per joint [N·m/rad], or the path of
     an identification; None for the environment's assumed model."""
     stiffness_scale: float = quantity("1", 1.0, gt=0)
-    """Further factor on the K that is assumed [1]."""
+    """Further factor on the assumed K [1]."""
     output: OutputMethod | None = None
     """Output compensator: "taylor" for Eq. 12, "newton" for Eq. 10, on the walker also "wrench" and
-    "none"; None for what the policy's name says."""
+    "none"; None for the method of the named policy."""
     gravity: GravityMethod | None = None
-    """How τ_g is computed: on the testbed "hinge" or "tree", on the walker "com", "ankle" or
+    """Method for τ_g: on the testbed "hinge" or "tree", on the walker "com", "ankle" or
     "lumped"; None for the first of them."""
     com_feedback: bool = True
-    """Walker: whether the controller feeds the center of mass back."""
+    """Walker: true to feed the center of mass back."""
     gains: WalkingGains | None = None
-    """Walker: gains of the controller, over those that the policy's name stands for."""
+    """Walker: gains of the controller; fields that are set replace those of the named policy."""
     base: str | None = None
     """Walker: the compensated policy that a feedback builds on; None for `input_output`, and for
     `dynamic` where `foothold` builds on it."""
     adaptation: AdaptationGains = AdaptationGains()
-    """How fast the stiffness is adapted."""
+    """Period, filter and limit of the adaptation of the stiffness."""
     posture: PostureGains = PostureGains()
     """Walker: gains of the posture feedback."""
     zmp_offset: ZmpOffsetGains | None = None
-    """Walker: how the planned ZMP is shifted against the mean error of the measured one; None
-    for not at all, and for `foothold` with its own time constant.
-    """
+    """Walker: gains of the ZMP offset; None for no offset, and in `foothold` for its own
+    time constant."""
     foothold: FootholdGains = FootholdGains()
-    """Walker: how `foothold` corrects where the feet land."""
+    """Walker: gains of the foothold correction of `foothold`."""
     standing: StandingGains = StandingGains()
-    """Walker: how `foothold` estimates the mean ZMP error of a walk from its standing."""
+    """Walker: coefficients of the standing estimate of `foothold`."""
     foot_tare: FootTareGains = FootTareGains()
-    """Walker: how `foothold` sets the foot sensors to zero."""
+    """Walker: gains of the foot tare of `foothold`."""
     dcm_observer: DcmObserverGains = DcmObserverGains()
     """Walker: filters and bound of `disturbance_observer`."""
     phase_table: Path | None = None
-    """Walker: file of the table of `phase_table`; None for the package's own of the gait."""
+    """Walker: file of the table of `phase_table`; None for the table that the package has."""
     stance_roll: StanceRollGains = StanceRollGains()
     """Walker: hip roll feedforward of `thormang`."""
     foot_balance: FootBalanceGains = FootBalanceGains()
@@ -69,10 +68,9 @@ class PolicyOptions(Model):
     observer: ObserverGains = ObserverGains()
     """Testbed: filters and bound of `disturbance_observer`."""
     learned_base: str | None = None
-    """The policy whose offsets `iterative` learns; None for `adaptive_posture` on the walker,
-    else `input`.
-    """
+    """Policy whose offsets `iterative` learns; None for `adaptive_posture` on the walker, else
+    `input`."""
     learning: LearningGains = LearningGains()
-    """How `iterative` learns, and from how many trials."""
+    """Gains of `iterative`, and its number of trials."""
     ramp_s: float = quantity("s", STAND_S, gt=0, le=3600)
-    """Time in which the compensation grows from zero [s]."""
+    """Time within which the compensation grows from zero [s]."""

@@ -209,9 +209,9 @@ def test_inputs_of_many_worlds_are_those_of_each_alone_and_of_the_exported_polic
     ]
     starts = [one.reset(seed=5 + i)[0] for i, one in enumerate(alone)]
     np.testing.assert_array_equal(shown, starts)
-    network = random_network(many._deciding.corrected, 0.5)
+    network = random_network(many._loop.corrected, 0.5)
     env = walkers(2)
-    played = ResidualPolicy(many._deciding.corrected, network)
+    played = ResidualPolicy(many._loop.corrected, network)
     observation, _ = env.reset(seed=5)
     state = None
     for _ in range(50):

@@ -161,8 +161,7 @@ class DisturbanceObserver(PolicyAround):
         action, inner = self.policy.act(rows, memory.inner, inputs)
         steps = memory.steps + 1
         joints = self._observe(rows, steps, memory.joints)
-        share = self._ramp.take(steps, mode="clip")
-        lead = share * joints.disturbance / self.model.stiffness
+        lead = self._ramp.take(steps, mode="clip") * joints.disturbance / self.model.stiffness
         memory = ObserverMemory(steps, joints, inner)
         return (action + lead).astype(np.float32), memory
 
@@ -193,16 +192,14 @@ class DisturbanceObserver(PolicyAround):
 
         def smooth(value: Array, before: Array) -> Array:
             """Value behind the common filter."""
-            filtered = before + self._smooth_share * (value - before)
-            return np.where(is_zeroing, value, filtered)
+            return np.where(is_zeroing, value, before + self._smooth_share * (value - before))
 
         delta = smooth(deflection, last.smooth_deflection)
         delta_dot = (deflection - delta) / gains.rate_filter_s
         q = smooth(theta - deflection, last.smooth_q)
         q_dot = (theta - deflection - q) / gains.rate_filter_s
         smooth_friction = smooth(friction, last.smooth_friction)
-        joints = (model.stiffness, model.damping, model.backlash)
-        passed = joint_torque(delta, delta_dot, *joints)
+        passed = joint_torque(delta, delta_dot, model.stiffness, model.damping, model.backlash)
         needed = self._static.gravity.inverse_dynamics(q, q_dot, (q_dot - last.rate) / dt)
         # at rest dry friction takes any value up to F: only torque beyond is a disturbance
         excess = passed - needed - last.disturbance

@@ -104,9 +104,9 @@ class Estimator(Protocol):
     def estimate(self, rows: Array, memory: Any) -> tuple[Array, Any]:
         """Correction r of every joint, (num_worlds, n) [1], and the new memory."""
 
-    def load(self, memory: Any) -> Array | None:  # noqa: ARG002
+    def load(self, memory: Any) -> Array | None:
         """Mean excess load μ within r, (num_worlds, 1) [1]; None for none."""
-        return None
+        return _mean(memory.loads) if isinstance(memory, EstimatorMemory) else None
 
 
 class EstimatorMemory(NamedTuple):
@@ -135,12 +135,7 @@ class LegEstimator(Estimator):
 
     @override
     def begin(self, num_worlds: int) -> EstimatorMemory:
-        loads = np.zeros((num_worlds, 2))
-        return EstimatorMemory(loads, self.observer.begin(num_worlds))
-
-    @override
-    def load(self, memory: EstimatorMemory) -> Array:
-        return _mean(memory.loads)
+        return EstimatorMemory(np.zeros((num_worlds, 2)), self.observer.begin(num_worlds))
 
     def observe(self, rows: Array, memory: EstimatorMemory) -> tuple[Array, Array, Any]:
         """Values of the observer, the mean excess load, (num_worlds, 1) [1], and new memory."""
@@ -203,14 +198,12 @@ class EncoderEstimator(Estimator):
         deflection = self._sensors.deflection(rows)
         q = self._view.theta(rows) - deflection
         displacement = np.where(memory.sums[:, 0] > 0.0, q - memory.q, 0.0)
-        coulomb = self._model.coulomb_friction
-        friction = presliding_friction(memory.friction, displacement, coulomb)
+        friction = presliding_friction(memory.friction, displacement, self._model.coulomb_friction)
         h = self._expected_deflection(rows, q, friction)
         y = deflection - h
         terms = np.stack([np.ones_like(h), h, h * h, y, h * y], axis=1)
         sums = memory.sums + self._sensors.has * terms
-        error = regress(sums.swapaxes(0, 1), self.prior)
-        return error, RegressionMemory(friction, q, sums)
+        return regress(sums.swapaxes(0, 1), self.prior), RegressionMemory(friction, q, sums)
 
     def _expected_deflection(self, rows: Array, q: Array, friction: Array) -> Array:
         """Deflection h under the torque of the motion and under friction, (num_worlds, n) [rad]."""
@@ -243,10 +236,6 @@ class LegEncoderEstimator(EncoderEstimator):
         load, loads = mean_load(memory.loads, excess)
         r = (1.0 + self._sensors.has * error) * (1.0 + load) - 1.0
         return r, EstimatorMemory(loads, observer)
-
-    @override
-    def load(self, memory: EstimatorMemory) -> Array:
-        return _mean(memory.loads)
 
     @override
     def _expected_deflection(self, rows: Array, q: Array, friction: Array) -> Array:

@@ -46,15 +46,12 @@ class LearnedOffsets(PolicyAround):
     ) -> None:
         super().__init__(policy, model)
         self._signals = signals
+        self.names = signals.names
+        """Names of the columns, with their unit."""
         self._ramp = Ramp(model, ramp_s)
         self._period_s = model.control_period_s
         self.tables = np.zeros((1, 1, len(signals.names)))
         self._offsets = np.zeros((1, 1, len(model.joint_names)))
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the columns, with their unit."""
-        return self._signals.names
 
     def play(self, tables: Array) -> None:
         """Use other offsets, (num_worlds or 1, T, k).
@@ -62,8 +59,7 @@ class LearnedOffsets(PolicyAround):
         Row t acts in the period that ends t periods after the start.
         """
         share = self._ramp.share(np.arange(tables.shape[1], dtype=np.float64))[:, None]
-        offsets = [self._signals.offsets(share * table) for table in tables]
-        self._offsets = np.stack(offsets)
+        self._offsets = np.stack([self._signals.offsets(share * table) for table in tables])
         self.tables = tables
 
     @override
@@ -175,12 +171,9 @@ class Trials:
         """
         n = self.num_worlds
         is_scalar = self._is_scalar
-        seeds: Any = [_noise_seed(robot, number) for robot in self._robots]
-        robots: Any = self._robots
-        if is_scalar:
-            seeds = seeds[0]
-            robots = robots[0]
-        after, _ = self._env.reset(seed=seeds, options={"robot_seed": robots})
+        seeds = [_noise_seed(robot, number) for robot in self._robots]
+        options = {"robot_seed": self._robots[0] if is_scalar else self._robots}
+        after, _ = self._env.reset(seed=seeds[0] if is_scalar else seeds, options=options)
         after = np.atleast_2d(after)
         error = np.full((n, self.num_steps + 1, len(signals.names)), np.nan)
         over = np.zeros(n, dtype=np.bool_)
@@ -210,5 +203,4 @@ class Trials:
 
 def _noise_seed(robot: int, number: int) -> int:
     """Seed of a trial's noise, different for every trial, and from the seed of the robot."""
-    sequence = np.random.SeedSequence([robot, number])
-    return int(sequence.generate_state(1, np.uint64)[0] >> 1)
+    return int(np.random.SeedSequence([robot, number]).generate_state(1, np.uint64)[0] >> 1)

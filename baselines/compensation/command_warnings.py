@@ -2,6 +2,7 @@
 
 import sys
 import warnings
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -25,33 +26,32 @@ def warn_caller(message: str) -> None:
     warnings.warn(message, stacklevel=level)
 
 
+@dataclass(frozen=True)
 class CommandWarnings:
     """Warnings about commands, each of them once.
 
-    Args:
+    Attributes:
         joints: Names of the joints.
         lowest, highest: Joint ranges, (n,) each [rad].
         limit_rad: Largest offset between command and desired angle [rad].
+        topics: Topics of earlier warnings.
     """
 
-    def __init__(
-        self, joints: tuple[str, ...], lowest: Array, highest: Array, limit_rad: float
-    ) -> None:
-        self._joints = joints
-        self._lowest = lowest
-        self._highest = highest
-        self._limit_rad = limit_rad
-        self._topics: set[str] = set()
+    joints: tuple[str, ...]
+    lowest: Array
+    highest: Array
+    limit_rad: float
+    topics: set[str] = field(default_factory=set)
 
     def warn_of_range(self, command: Array) -> None:
         """Warn of a command, (n,) [rad], that is beyond a joint range."""
-        excess = np.maximum(self._lowest - command, command - self._highest)
+        excess = np.maximum(self.lowest - command, command - self.highest)
         if excess.max() > 0.0:
             worst = int(excess.argmax())
-            ends = f"{self._lowest[worst]:.4g} to {self._highest[worst]:.4g} rad"
+            ends = f"{self.lowest[worst]:.4g} to {self.highest[worst]:.4g} rad"
             self._warn_once(
                 "range",
-                f"joint {self._joints[worst]!r} needs the command {command[worst]:.4g} rad, beyond"
+                f"joint {self.joints[worst]!r} needs the command {command[worst]:.4g} rad, beyond"
                 f" its range of {ends} in the model: its link stays {excess[worst]:.2g} rad short;"
                 " keep q_desired that far from the end",
             )
@@ -59,13 +59,13 @@ class CommandWarnings:
     def warn_of_limit(self, offsets: Array, when: str) -> None:
         """Warn of offsets, (n,) [rad], one of which is beyond `limit_rad`."""
         needed = float(offsets.max())
-        joint = self._joints[offsets.argmax()]
+        joint = self.joints[offsets.argmax()]
         digit = 10.0 ** (np.floor(np.log10(needed)) - 1.0)
         enough = np.ceil(1.05 * needed / digit) * digit
         self._warn_once(
             "limit_rad",
             f"the load needs an offset of {needed:.3g} rad of joint {joint!r} {when},"
-            f" and commands are cut at limit_rad = {self._limit_rad:g}: the link ends"
+            f" and commands are cut at limit_rad = {self.limit_rad:g}: the link ends"
             f" short of where it should be; limit_rad={enough:.3g} is enough",
         )
 
@@ -81,11 +81,11 @@ class CommandWarnings:
             cure = "set the payload to 0 where it was, and let ramp_s pass before"
         self._warn_once(
             "jump",
-            f"the payload moves the command of joint {self._joints[worst]!r} by {1e3 * size:.3g}"
+            f"the payload moves the command of joint {self.joints[worst]!r} by {1e3 * size:.3g}"
             f" mrad at once; {cure}",
         )
 
     def _warn_once(self, topic: str, text: str) -> None:
-        if topic not in self._topics:
-            self._topics.add(topic)
+        if topic not in self.topics:
+            self.topics.add(topic)
             warn_caller(text)

@@ -109,8 +109,7 @@ class Compensated(PolicyAround):
         compensated = rows.copy()
         compensated[:, self._theta] = links
         if self.policy.reads_rates:
-            rates = compensator.link_rate(theta, rows[:, self._theta_dot])
-            compensated[:, self._theta_dot] = rates
+            compensated[:, self._theta_dot] = compensator.link_rate(theta, rows[:, self._theta_dot])
         action, inner = self.policy.act(compensated, memory.inner, inputs)
         action = action.astype(np.float64)
         motion = self.view.motion(rows)

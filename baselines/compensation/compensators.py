@@ -172,8 +172,7 @@ class GravityCompensator(Compensator):
 
     @override
     def offset(self, motion: Motion, memory: Array) -> tuple[Array, Array]:
-        compliance = self.servo_compliance
-        return input_offset(motion.q, self.stiffness, self.gravity, compliance), memory
+        return input_offset(motion.q, self.stiffness, self.gravity, self.servo_compliance), memory
 
     @override
     def deflection(self, offset: Array, memory: Array) -> Array:

@@ -179,9 +179,8 @@ def planned_loads(observations: Any, contact: Any, feet: Any, level: Any, tilted
         x = zmp_from_middle(obs, stance, share, 0)
         y = zmp_from_middle(obs, stance, share, 1)
         for foot in range(2):
-            weight = share if foot == 1 else 1.0 - share
             # the ground's force is a negative mass at the contact point
-            load.mass[foot] = -ground.mass * weight
+            load.mass[foot] = -ground.mass * (share if foot == 1 else 1.0 - share)
             load.point[foot] = 0.0
             load.wrench[foot] = 0.0
             if ground.is_at_zmp:
@@ -271,9 +270,7 @@ def shift_plan(observations: Any, shift: Array, feet: Any, period_s: float) -> N
 
 
 @compiled
-def shifted_shares(
-    observations: Any, shift: Array, feet: Any, period_s: float, shares: Array
-) -> None:
+def shifted_shares(observations: Any, shift: Array, feet: Any, period_s: float, out: Array) -> None:
     """Fill in load shares of the right foot after the last control period, under a shifted ZMP.
 
     Args:
@@ -281,12 +278,12 @@ def shifted_shares(
         shift: Shift of the ZMP in the local frame, x forward and y left, (n, 2) [m].
         feet: Rows of `planned_feet`.
         period_s: Control period [s].
-        shares: To be filled, (n,).
+        out: To be filled, (n,).
     """
-    for world in range(len(shares)):
+    for world in range(len(out)):
         stance = feet[plan_row(observations[world], period_s, 1.0, len(feet))]
         across = shift_across(shift[world], stance)
-        shares[world] = shifted_share(stance.share, across, stance.spacing)
+        out[world] = shifted_share(stance.share, across, stance.spacing)
 
 
 @compiled_part

@@ -110,8 +110,7 @@ class FrictionCompensation:
 
     def largest_joint_torque(self, torque: Array) -> Array:
         """Largest τ_J under loads of either sign at rest, (..., n) [N·m] to (..., n) [N·m]."""
-        friction = self.coulomb + self.static
-        return passed_torque(np.abs(torque), 1.0, friction, self.load_ratio)
+        return passed_torque(np.abs(torque), 1.0, self.coulomb + self.static, self.load_ratio)
 
     def _load_and_friction(self, torque: Array, speed: Array, memory: FrictionMemory) -> Array:
         """Load with the friction that does not grow with it, (..., n) [N·m]."""

@@ -108,8 +108,7 @@ def largest_gravity_torque(body: RigidBody, lowest: Array, highest: Array) -> Ar
     """
     lowest = np.where(np.isfinite(lowest), lowest, -np.pi)
     highest = np.where(np.isfinite(highest), highest, np.pi)
-    generator = np.random.default_rng(0)
-    poses = generator.uniform(lowest, highest, (_POSES, len(lowest)))
+    poses = np.random.default_rng(0).uniform(lowest, highest, (_POSES, len(lowest)))
     torque = np.abs(body.gravity_torque(poses))
     largest = torque.max(axis=0)
     for joint, pose in enumerate(poses[torque.argmax(axis=0)]):

@@ -33,20 +33,17 @@ _Settings = Mapping[str, JointSettings]
 _FILES = (".yaml", ".yml")
 
 
-def is_joint_file(stiffness: Any) -> bool:
-    """True for a path of a file of joints."""
-    return isinstance(stiffness, str | Path) and Path(stiffness).suffix in _FILES
-
-
-def read_joint_file(model: mujoco.MjModel, file: Path, commanded: Any) -> dict[str, Any]:
-    """Read a file of joints; commanded hinges that it leaves out are rigid.
+def read_joint_file(model: mujoco.MjModel, stiffness: Any, commanded: Any) -> Any:
+    """Content of a file of joints, in which commanded hinges that it leaves out are rigid.
 
     Args:
         model: Compiled rigid model.
-        file: YAML file with a mapping by joint.
+        stiffness: YAML file with a mapping by joint; anything else is returned as it is.
         commanded: Names of the commanded joints; None for all.
     """
-    mapping = read_mapping(file)
+    if not isinstance(stiffness, str | Path) or Path(stiffness).suffix not in _FILES:
+        return stiffness
+    mapping = read_mapping(Path(stiffness))
     hinges = np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE)
     names = [model.joint(int(j)).name for j in hinges]
     left_out = [name for name in names if name and key_of(mapping, name) is None]
@@ -54,7 +51,7 @@ def read_joint_file(model: mujoco.MjModel, file: Path, commanded: Any) -> dict[s
     if not rigid or len(left_out) == len(names):
         return mapping
     warn_caller(
-        f"{file} leaves out {', '.join(rigid)}, taken for rigid; write {rigid[0]}: {RIGID},"
+        f"{stiffness} leaves out {', '.join(rigid)}, taken for rigid; write {rigid[0]}: {RIGID},"
         f" {rigid[0]}: {HELD} or its stiffness K [N·m/rad] there"
     )
     return mapping | dict.fromkeys(rigid, RIGID)
@@ -158,9 +155,7 @@ def servo_gains(model: mujoco.MjModel, settings: _Settings, position_gain: Any) 
     return np.array(gains)
 
 
-def friction_compensation(
-    settings: _Settings, friction: bool | None
-) -> FrictionCompensation | None:
+def make_friction(settings: _Settings, friction: bool | None) -> FrictionCompensation | None:
     """Compensation of the dry friction of joints; None without.
 
     Args:

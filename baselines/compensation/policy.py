@@ -269,11 +269,9 @@ class UserPolicy(BatchPolicy):
 
     @override
     def act(self, rows: Array, memory: UserMemory, inputs: PolicyInputs) -> Step:
-        observation = rows[0] if inputs.is_single else rows
+        obs = rows[0] if inputs.is_single else rows
         start = ~memory.has_begun
-        action, state = self._policy.predict(
-            observation, memory.state[0], start, inputs.deterministic
-        )
+        action, state = self._policy.predict(obs, memory.state[0], start, inputs.deterministic)
         offset = np.atleast_2d(np.asarray(action, dtype=np.float64))
         return offset, UserMemory(np.ones(len(rows), dtype=np.bool_), [state])
 

@@ -31,8 +31,7 @@ from baselines.compensation.dry_friction import FrictionCompensation
 from baselines.compensation.gravity_torque import largest_gravity_torque
 from baselines.compensation.joint_arguments import (
     PerJoint,
-    friction_compensation,
-    is_joint_file,
+    make_friction,
     read_joint_file,
     read_stiffness,
     servo_gains,
@@ -160,8 +159,7 @@ class PositionCompensator:
         require_robot(model)
         leaves_out_held = joints is None
         if joints is None:
-            names = stiffness if isinstance(stiffness, Mapping) else ()
-            joints = commanded_hinges(model, names)
+            joints = commanded_hinges(model, stiffness if isinstance(stiffness, Mapping) else ())
         self.settings = read_stiffness(model, stiffness, joints, leaves_out_held)
         self.joints = tuple(self.settings)
         settings = list(self.settings.values())
@@ -180,7 +178,7 @@ class PositionCompensator:
             limit_rad=limits.limit_rad,
             ramp_steps=int(np.ceil(limits.ramp_s / limits.period_s)),
             period_s=limits.period_s,
-            friction=friction_compensation(self.settings, friction),
+            friction=make_friction(self.settings, friction),
             viscous=np.array([joint.viscous_friction or 0.0 for joint in settings]),
             lag_s=np.array([joint.servo.braking for joint in settings]) / gains,
             fastest=np.array([joint.servo.fastest for joint in settings]),
@@ -214,9 +212,7 @@ class PositionCompensator:
         """
         compiled = compiled_model(model)
         require_robot(compiled)
-        by_joint: Any = stiffness
-        if is_joint_file(stiffness):
-            by_joint = read_joint_file(compiled, Path(by_joint), options.get("joints"))
+        by_joint = read_joint_file(compiled, stiffness, options.get("joints"))
         return cls(compiled, by_joint, **options)
 
     def reset(self) -> None:

@@ -98,8 +98,7 @@ class BendingObserver:
         measured, expected = self.disagreement(rows, bending)
         memory = memory.copy()
         estimates = np.empty((len(rows), len(self.signals)))
-        observations = self._view.fields(rows)
-        regress(observations, measured, expected, self.carried, memory, estimates)
+        regress(self._view.fields(rows), measured, expected, self.carried, memory, estimates)
         return estimates, memory
 
     def bending(self, rows: Array) -> Array:

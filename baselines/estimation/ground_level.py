@@ -114,8 +114,7 @@ class GroundLevel:
         change = self._gravity * TILT_RAD * self._period_s * number
         certainty = change**2 / (change**2 + VELOCITY_M_PER_S**2)
         tilt = mean * certainty[:, None]
-        R = rotation_of_tilt(tilt)
-        upright = force @ R.swapaxes(-1, -2)
+        upright = force @ rotation_of_tilt(tilt).swapaxes(-1, -2)
         x, y = np.moveaxis(over_ankles * (upright - force)[..., :2], -1, 0)
         level_moment = moment + np.stack([-y, x, np.zeros_like(x)], axis=-1)
         wrenches = np.stack([upright, level_moment], axis=2).reshape(n, -1)
@@ -123,8 +122,7 @@ class GroundLevel:
 
     def _mean(self, force: Array, velocity: Array, memory: Any) -> tuple[Array, Array]:
         """Mean after a measurement, about x and y [rad], and the number of measurements in it."""
-        has_velocity = np.isfinite(memory.velocity).all(axis=1)
-        is_known = (force[:, 2] >= self._least_n) & has_velocity
+        is_known = (force[:, 2] >= self._least_n) & np.isfinite(memory.velocity).all(axis=1)
         accelerated = (velocity - memory.velocity) / (self._period_s * self._gravity)
         direction = force[:, :2] / np.where(is_known, force[:, 2], np.inf)[:, None]
         lean = direction - np.where(is_known[:, None], accelerated, 0.0)

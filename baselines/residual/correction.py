@@ -70,13 +70,10 @@ class Corrected:
         self.truth = truth
         self.view = self.base.view
         self.channels = Channels(model, settings)
+        self.num_residuals = len(self.channels.signals)
+        """Number k of values in a residual."""
         cycles = settings.cutoff_hz * model.control_period_s
         self._filter_share = 1.0 - float(np.exp(-2.0 * np.pi * cycles))
-
-    @property
-    def num_residuals(self) -> int:
-        """Number k of values in a residual."""
-        return len(self.channels.signals)
 
     def begin(self, rows: Array) -> CorrectedMemory:
         """Memory at the start of an episode with these first observations, (num_worlds, m)."""
@@ -121,8 +118,7 @@ class Corrected:
 
     def base_action(self, rows: Array, state: Any, episode_start: Any) -> Array:
         """Command of the base alone, (num_worlds, n) [rad]."""
-        memory = self.base_memory(rows, state, episode_start)
-        return self.base.act(rows, memory, NO_INPUTS)[0]
+        return self.base.act(rows, self.base_memory(rows, state, episode_start), NO_INPUTS)[0]
 
     def link_estimate(self, observation: Array, state: Any) -> Array:
         """Estimated link angles for an observation and the state after it, (..., n) [rad]."""

@@ -88,8 +88,10 @@ class Features:
         self._measured = np.flatnonzero([signal.kind == "measured" for signal in present])
         self._history = settings.history
         commands = model.observation_table.signals_of("last_command")
-        action = rename_group(commands, BASE_ACTION) if self._has_action else ()
-        self.signals = (*present, *action)
+        self.signals = (
+            *present,
+            *(rename_group(commands, BASE_ACTION) if self._has_action else ()),
+        )
         measured = [present[i] for i in self._measured]
         earlier = [
             replace(signal, name=f"{signal.name}@-{k + 1}")
@@ -97,18 +99,14 @@ class Features:
             for signal in measured
         ]
         self.columns = (*self.signals, *earlier)
-        self.mirror = LeftFirst(self.columns, corrected) if settings.mirror else None
-
-    @property
-    def width(self) -> int:
+        self.width = len(self.columns)
         """Number of features."""
-        return len(self.columns)
+        self.mirror = LeftFirst(self.columns, corrected) if settings.mirror else None
 
     def begin(self, num_worlds: int) -> FeaturesMemory:
         """Memory before the first decision."""
         past = np.zeros((num_worlds, self._history * len(self._measured)))
-        sources = [source.begin(num_worlds) for source in self._sources]
-        return FeaturesMemory(past, tuple(sources))
+        return FeaturesMemory(past, tuple([source.begin(num_worlds) for source in self._sources]))
 
     def at(
         self, rows: Array, memory: Any, is_first: BoolArray, state: Any, episode_start: Any
@@ -139,8 +137,7 @@ class Features:
         observed = [source.observe(rows, memory) for source, memory in pairs]
         present = np.hstack([np.zeros((len(rows), 0)), *(values for values, _ in observed)])
         measured = present[:, self._measured]
-        repeated = np.tile(measured, (1, self._history))
-        past = np.where(is_first[:, None], repeated, last.past)
+        past = np.where(is_first[:, None], np.tile(measured, (1, self._history)), last.past)
         parts = [present]
         if self._has_action:
             action = self._corrected.base_action(rows, state, episode_start)
@@ -163,8 +160,7 @@ class Features:
 
 def _groups(model: RobotModel) -> list[str]:
     """Groups of a robot's observation, in order."""
-    names = model.observation_table.names
-    return list(dict.fromkeys(name.split(".")[0] for name in names))
+    return list(dict.fromkeys(name.split(".")[0] for name in model.observation_table.names))
 
 
 def _source_names(observe: tuple[str, ...], model: RobotModel) -> list[str]:

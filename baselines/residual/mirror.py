@@ -122,6 +122,6 @@ def _other_side(name: str) -> str:
 def _sign(signal: Signal) -> float:
     if signal.mirrored is None:
         raise ConfigurationError(
-            f"the sign of {signal.name!r} in the mirror is not known; leave it out, or mirror: false"
+            f"the sign of {signal.name!r} in the mirror is unknown; leave it out, or mirror: false"
         )
     return _SIGN[signal.mirrored]

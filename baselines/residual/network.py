@@ -86,21 +86,14 @@ class Network:
         self._activation = _ACTIVATIONS[settings.activation]
         self._output = settings.output
         self._clip = settings.clip
-
-    @property
-    def num_features(self) -> int:
+        self.num_features = len(self._mean)
         """Width of the input."""
-        return len(self._mean)
-
-    @property
-    def num_outputs(self) -> int:
+        self.num_outputs = len(self._layers[-1][1])
         """Width of the output."""
-        return len(self._layers[-1][1])
 
     def __call__(self, features: Array) -> Array:
         """Residual in [−1, 1], (num_worlds, features) to (num_worlds, k)."""
-        normalised = (features - self._mean) / self._std
-        x = np.clip(normalised, -self._clip, self._clip).astype(np.float32)
+        x = np.clip((features - self._mean) / self._std, -self._clip, self._clip).astype(np.float32)
         for number, (W, b) in enumerate(self._layers):
             x = affine(x, W, b)
             if number < len(self._layers) - 1:

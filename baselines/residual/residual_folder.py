@@ -104,7 +104,7 @@ def load_residual(folder: Path) -> tuple[ResidualDescription, Network]:
     if description.weights_sha256 not in (None, digest):
         raise ConfigurationError(
             f"{folder / WEIGHTS} was changed: {DESCRIPTION} names the SHA-256 digest"
-            f" {description.weights_sha256}, it has {digest}; copy it again, or leave weights_sha256"
-            " out if you mean these weights"
+            f" {description.weights_sha256}, it has {digest}; copy it again, or leave"
+            " weights_sha256 out if you mean these weights"
         )
     return description, network

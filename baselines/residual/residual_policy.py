@@ -65,15 +65,13 @@ class ResidualPolicy(BatchPolicy):
         n = len(rows)
         wait = np.full(n, _UNDECIDED)
         residual = np.zeros((n, self.corrected.num_residuals))
-        features = self.features.begin(n)
-        return ResidualMemory(wait, residual, features, self.corrected.begin(rows))
+        return ResidualMemory(wait, residual, self.features.begin(n), self.corrected.begin(rows))
 
     @override
     def act(self, rows: Array, memory: ResidualMemory, inputs: PolicyInputs) -> Step:
         due = memory.wait <= 0
         if np.count_nonzero(due) > 0:
-            decision = select_rows(self._decide(rows, memory, due), due)
-            memory = put_rows(memory, due, decision)
+            memory = put_rows(memory, due, select_rows(self._decide(rows, memory, due), due))
         action, inner = self.corrected.correct(rows, memory.residual, memory.inner, inputs)
         return action, memory._replace(wait=memory.wait - 1, inner=inner)
 

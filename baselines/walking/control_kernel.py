@@ -173,8 +173,7 @@ def offset_leg(
     first = 6 * leg
     sign = 1.0 - 2.0 * leg
     difference = memory.difference + added.leg_length
-    planned_knee = obs.reference_angle[first + 3]
-    hip, knee, ankle = lengthening(constants, planned_knee, difference, sign)
+    hip, knee, ankle = lengthening(constants, obs.reference_angle[first + 3], difference, sign)
     share = obs.load_share if leg == 1 else 1.0 - obs.load_share
     load = share * constants.weight
     cosine = planned.foot_yaw[leg, 0]

@@ -157,8 +157,7 @@ class WalkingController(BatchPolicy):
         """Act for a control step; an input `deflection` r winds the springs by 1 + r as much."""
         observations = self._walk_view.fields(rows)
         theta = rows[:, self._theta]
-        attitude = rows[:, self._attitude]
-        com, soles = self._biped.chains.com_and_feet(theta, self._sole, attitude)
+        com, soles = self._biped.chains.com_and_feet(theta, self._sole, rows[:, self._attitude])
         shares = _NO_SHARES
         if (shift := inputs.zmp_shift) is not None:
             shares = np.empty(len(rows))

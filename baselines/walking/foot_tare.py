@@ -79,8 +79,7 @@ def unloaded_wrench(model: WalkerModel) -> Array:
     sensors = FootSensors.of_biped(biped)
     _, acceleration = derivatives(model.plan.ankles, model.control_period_s)
     mass = biped.rigid.body_mass[biped.feet]
-    in_feet = turn(acceleration, -model.plan.foot_yaw)
-    force = sensors.weight - mass[:, None] * in_feet
+    force = sensors.weight - mass[:, None] * turn(acceleration, -model.plan.foot_yaw)
     return np.stack([force, np.cross(sensors.com, force)], axis=2)
 
 

@@ -141,18 +141,12 @@ def hip_offsets(turn: Array) -> Array:
 
 @compiled
 def add_feedback(
-    settings: Any,
-    observations: Any,
-    ramp: Array,
-    change: Array,
-    before: Any,
-    after: Any,
-    out: Array,
+    params: Any, observations: Any, ramp: Array, change: Array, before: Any, after: Any, out: Array
 ) -> None:
     """Add the turn of the hips against the pelvis' tilt, and fill in the memory after the step.
 
     Args:
-        settings: Gains, a row, (1,).
+        params: Gains, a row, (1,).
         observations: Rows with fields.
         ramp: Share of the feedback after 0, 1, ... control steps, up to the last one [1].
         change: Relative change of all gains, (n, 1) [1], or none, (0, 1); the integral itself does
@@ -161,7 +155,7 @@ def add_feedback(
         after: The same after the control step, to be filled.
         out: Offsets of the joints, to be added to, (n, 12) [rad].
     """
-    gains = settings[0]
+    gains = params[0]
     for world in range(len(out)):
         obs = observations[world]
         last = before[world]

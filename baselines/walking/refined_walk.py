@@ -32,8 +32,7 @@ def refine_model(model: WalkerModel) -> WalkerModel:
     Raises:
         ElasticError: A foot is out of reach on the refined plan.
     """
-    plan = refine_plan(model.plan, model.biped, model.control_period_s)
-    return replace(model, plan=plan)
+    return replace(model, plan=refine_plan(model.plan, model.biped, model.control_period_s))
 
 
 class RefinedWalk(PassingMemory):
@@ -60,5 +59,4 @@ class RefinedWalk(PassingMemory):
         refined_rows = rows.copy()
         refined_rows[:, self._columns] += change
         action, memory = self.policy.act(refined_rows, memory, inputs)
-        total = action + change[:, : self.view.num_joints]
-        return total.astype(np.float32), memory
+        return (action + change[:, : self.view.num_joints]).astype(np.float32), memory

@@ -122,17 +122,16 @@ class StandingEstimate(PolicyAround):
             force, error = self._feet.ground(rows, rows[:, self._wrench])
             measured = np.hstack([np.nan_to_num(error, nan=0.0), rows[:, self._attitude]])
             total = total + is_at_rest[:, None] * measured
-            vertical = force[:, 0, 2] + force[:, 1, 2]
-            load = load + is_at_rest * (vertical / self._weight - 1.0)
+            load = load + is_at_rest * ((force[:, 0, 2] + force[:, 1, 2]) / self._weight - 1.0)
         zmp = np.zeros((len(rows), 2)) if inputs.zmp is None else inputs.zmp.copy()
         gains = (self._per_total, self._constant, self._limit)
-        add_predicted_shift(gains, self._ramp, steps, total, zmp)
+        add_prediction(gains, self._ramp, steps, total, zmp)
         action, inner = self.policy.act(rows, memory.inner, inputs._replace(zmp=zmp))
         return action, StandingMemory(steps, total, load, inner)
 
 
 @compiled
-def add_predicted_shift(gains: Any, ramp: Array, steps: IntArray, total: Array, zmp: Array) -> None:
+def add_prediction(gains: Any, ramp: Array, steps: IntArray, total: Array, zmp: Array) -> None:
     """Add the shift of the planned ZMP that the measurements at rest predict.
 
     Args:

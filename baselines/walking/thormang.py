@@ -113,8 +113,7 @@ class StanceRoll(PassingMemory):
     def act(self, rows: Array, memory: Any, inputs: PolicyInputs) -> Step:
         _, swing, support = rows[:, self._clock].T
         action, memory = self.policy.act(rows, memory, inputs)
-        total = action + stance_roll(swing, support, self._gains)
-        return total.astype(np.float32), memory
+        return (action + stance_roll(swing, support, self._gains)).astype(np.float32), memory
 
 
 class FootBalanceGains(Model):
