@@ -114,7 +114,7 @@ class ResidualWrapper(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorAr
         gymnasium.Wrapper.__init__(self, env)
         self._loop = _DecisionLoop(env, base_policy, settings, num_worlds=1)
         self.settings = self._loop.settings
-        """How the residual acts."""
+        """Settings of the residual."""
         self.observation_space = self._loop.observation_space
         self.action_space = self._loop.action_space
         self._last = np.zeros(0)
@@ -154,7 +154,7 @@ class ResidualVectorWrapper(gymnasium.vector.VectorWrapper[Any, Any, Any]):
     Args:
         env: A vector environment of ours.
         base_policy: A policy for it, or the name of one.
-        autoreset_mode: When it restarts worlds; None for the mode of the environment.
+        autoreset_mode: Time at which it restarts worlds; None for the mode of the environment.
         critic_sees: Truth in further columns after the features of the residual, for a critic only.
         **settings: As in `ResidualWrapper`.
 
@@ -177,7 +177,7 @@ class ResidualVectorWrapper(gymnasium.vector.VectorWrapper[Any, Any, Any]):
         inner: Any = env.unwrapped
         self.autoreset_mode = autoreset_mode or inner.autoreset_mode
         self.settings = self._loop.settings
-        """How the residual acts."""
+        """Settings of the residual."""
         n = env.num_envs
         self.single_observation_space = self._loop.observation_space
         self.single_action_space = self._loop.action_space

@@ -123,7 +123,7 @@ class GravityCompensator(Compensator):
         model: Assumed robot.
         output: "taylor" for Eq. 12, "newton" for Eq. 10, "wrench" for Eq. 12 with the torque of the
             measured foot wrenches (walker), "none" to leave the encoder as it is.
-        method: How the gravity torque is computed; None for the robot's default.
+        method: Method for the gravity torque; None for the robot's default.
 
     Raises:
         ConfigurationError: Unknown output method or gravity method, or one that the robot does not
@@ -158,13 +158,13 @@ class GravityCompensator(Compensator):
     def at(self, rows: Array) -> "GravityCompensator":
         if not isinstance(self.model, WalkerModel):
             return self
-        bound = shallow_copy(self)
+        compensator = shallow_copy(self)
         if self._load is self.gravity:
-            bound.gravity, bound._load = self.gravity.level_and_tilted(rows)
+            compensator.gravity, compensator._load = self.gravity.level_and_tilted(rows)
         else:
-            bound.gravity = self.gravity.at(rows)
-            bound._load = self._load.at(rows)
-        return bound
+            compensator.gravity = self.gravity.at(rows)
+            compensator._load = self._load.at(rows)
+        return compensator
 
     @override
     def begin(self, motion: Motion) -> Array:

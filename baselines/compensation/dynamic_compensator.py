@@ -50,7 +50,7 @@ class DynamicCompensator(Compensator):
     Args:
         model: Assumed robot, with a servo on every joint.
         output: Method for the rate estimate and for the start, as in `GravityCompensator`.
-        method: How the static torque is computed; None for the robot's default.
+        method: Method for the static torque; None for the robot's default.
         friction: True to include the model's dry friction in the joint torque: Coulomb friction,
             and friction that grows with the load or falls from rest.
     """
@@ -93,10 +93,10 @@ class DynamicCompensator(Compensator):
         static = self._static.at(rows)
         if static is self._static:
             return self
-        bound = shallow_copy(self)
-        bound._static = static
-        bound._body = self._body.at(rows, static.gravity)
-        return bound
+        compensator = shallow_copy(self)
+        compensator._static = static
+        compensator._body = self._body.at(rows, static.gravity)
+        return compensator
 
     def with_stiffness(self, stiffness: Array) -> Self:
         """Compensator with another K, for all worlds or each of them, (..., n) [N·m/rad]."""

@@ -71,7 +71,7 @@ class HingeTorque:
         model: Robot with one joint, about which its inertia I is always the same.
 
     Raises:
-        ConfigurationError: It has more joints.
+        ConfigurationError: The robot has more joints.
     """
 
     def __init__(self, model: RobotModel) -> None:

@@ -121,7 +121,7 @@ def servo_gains(model: mujoco.MjModel, settings: _Settings, position_gain: Any) 
     """k_p of servos that give way, infinite for servos that hold their angle, (n,) [N·m/rad].
 
     Args:
-        model: Its position actuators give k_p where `settings` have a part of the servo only.
+        model: Compiled rigid model; its position actuators give what `settings` leave out.
         settings: Commanded joints.
         position_gain: The argument; None for the servos of `settings`.
 

@@ -35,7 +35,7 @@ def require_sensor(table: SignalTable, sensor: str, group: str | None = None) ->
         group: Name of its columns; None for the same.
 
     Raises:
-        ConfigurationError: It does not have it.
+        ConfigurationError: The observation does not have the sensor.
     """
     if (group or sensor) not in {name.split(".")[0] for name in table.names}:
         raise ConfigurationError(
@@ -87,8 +87,8 @@ class MeasuredCompensator(DynamicCompensator):
     Args:
         model: Assumed robot.
         sensors: Sensors of the joints; the model gives the links of other joints, and all rates.
-        output: As in `DynamicCompensator`.
-        method: As in `DynamicCompensator`.
+        output: Argument of `DynamicCompensator`.
+        method: Argument of `DynamicCompensator`.
     """
 
     def __init__(
@@ -107,9 +107,9 @@ class MeasuredCompensator(DynamicCompensator):
 
     @override
     def at(self, rows: Array) -> Self:
-        bound = shallow_copy(super().at(rows))
-        bound._deflection = self._sensors.deflection(rows)
-        return bound
+        compensator = shallow_copy(super().at(rows))
+        compensator._deflection = self._sensors.deflection(rows)
+        return compensator
 
     @override
     def link_angle(self, theta: Array, memory: DriveMemory) -> Array:

@@ -50,7 +50,7 @@ class ObservationView:
         """Observation with one row per world, (num_worlds, m).
 
         Raises:
-            ElasticError: It does not have the columns of the table.
+            ElasticError: The observation does not have the columns of the table.
         """
         rows = np.asarray(observation, dtype=np.float64)
         rows = rows[None] if rows.ndim < 2 else rows

@@ -82,9 +82,9 @@ class TrueCompensator(DynamicCompensator):
                 " environment that it is to run in"
             )
         truth = self._env.truth()
-        bound = super().at(rows).with_stiffness(truth.stiffness)
-        bound._truth = truth
-        return bound
+        compensator = super().at(rows).with_stiffness(truth.stiffness)
+        compensator._truth = truth
+        return compensator
 
     @override
     def begin(self, motion: Motion) -> Any:

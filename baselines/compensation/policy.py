@@ -130,7 +130,7 @@ class BatchPolicy(ABC):
         """Link angles that the policy saw instead of encoder angles, (..., n) [rad].
 
         Args:
-            observation: As in `predict`.
+            observation: Argument of `predict`.
             state: State that `predict` returned for it.
         """
         angles = self.link_angles(self.view.rows(observation), state)

@@ -132,8 +132,8 @@ class PositionCompensator:
             payload grows [s].
         period_s: Time between two commands, for the ramp, and for the rate of desired angles
             without one [s].
-        friction: True to compensate the dry friction in `stiffness`; None where any of it grows
-            with the load or falls from rest.
+        friction: True to compensate the dry friction in `stiffness`, False not to; None to do so
+            where any of it grows with the load or falls from rest.
 
     Raises:
         ConfigurationError: The model or a value cannot be used; the message names it.

@@ -4,7 +4,7 @@
 |---|---|
 | a group or a signal of the observation, such as `clock` or `clock.swing` | the same |
 | `observation` | all groups |
-| `encoder_error` | encoder angles less reference angles, which are small beside both [rad] |
+| `encoder_error` | encoder angles less reference angles, which are small compared with both [rad] |
 | `link_error` | with encoders on the links: reference angles less the links' angles, small too [rad] |
 | `contact_error` | walker: measured ZMP [m] and load share [1] as on level ground, less the planned ones |
 | `zmp_error` | walker: measured ZMP of flat feet less the planned one [m], whatever the ground's tilt adds |

@@ -28,9 +28,9 @@ class ResidualSettings(Model):
         default={DEFLECTION: None}, min_length=1, max_length=MOST_ENTRIES
     )
     """Inputs of the base that it acts on (`baselines.compensation.inputs`), and the value of each
-    at a residual of 1. That is a number for all columns, or a mapping by the end of the joints'
-    names or by axis, as in {deflection: {ankle_roll: 0.6}, zmp: {x: 0.02}}, which leaves the others
-    alone. None takes the input's default."""
+    at a residual of 1. This is a number for all columns, or a mapping by the end of the joints'
+    names or by axis, as in {deflection: {ankle_roll: 0.6}, zmp: {x: 0.02}}: then it does not act on
+    other columns. None takes the input's default."""
     decision_period: int = quantity("1", 25, ge=1, le=100_000)
     """Control steps between decisions [1]."""
     cutoff_hz: float = quantity("Hz", 2.0, gt=0, le=1e6)
@@ -39,20 +39,19 @@ class ResidualSettings(Model):
     """Joints in which it acts, where an input has one column per joint, by the end of their names
     (ankle_roll means both); None for all."""
     shared: bool = False
-    """Left and right joints of the same name share their residual: there are half as many to
-    explore, and one that follows the step still tells the legs apart by which of them carries the
-    robot."""
+    """True for one residual per pair of left and right joints of the same name: there are half as
+    many to explore. A residual that follows the steps can still act on one leg at a time."""
     mirror: bool = False
-    """It sees a step on the right foot in the mirror, as a step on the left, and what it decides is
-    turned back (`baselines.residual.mirror`). For a walker."""
+    """True to show it steps on the right foot in the mirror, as steps on the left, and to turn its
+    decision back (`baselines.residual.mirror`). For a walker."""
     observe: _Titles = ("observation",)
     """Features that it sees: groups of the observation such as (clock, load_share), or all of it,
-    and what `baselines.residual.features` makes of it and of the plan."""
+    and the features in `baselines.residual.features`."""
     history: int = quantity("1", 0, ge=0, le=1000)
-    """Earlier decisions whose measurements it sees as well [1]."""
+    """Number of earlier decisions whose measurements it sees as well [1]."""
     privileged: tuple[Title, ...] = Field(default=(), max_length=MOST_ENTRIES)
-    """What a teacher sees of the true robot (`baselines.residual.true_robot`); none for a residual
-    that a robot can play. For a walker in simulation."""
+    """Quantities of the true robot that a teacher sees (`baselines.residual.true_robot`); empty for
+    a residual that a robot can play. For a walker in simulation."""
 
     def _check(self) -> None:
         require_known("input", self.acts_on, INPUTS)
@@ -98,8 +97,8 @@ def require_plain_base(name: str) -> str:
     """Check the name of a base policy, and return it.
 
     Raises:
-        ValueError: It is itself a residual, which could name another, or itself; or it is code,
-            which a folder from elsewhere must not run.
+        ValueError: The base is itself a residual, which could name another, or itself; or it is
+            code, which a folder from elsewhere must not run.
     """
     if name.startswith(RESIDUAL):
         raise ValueError(f"a base must be no residual itself, got {name!r}; name a baseline")

@@ -2,8 +2,8 @@ r"""The walking controller: foot forces, and feedback of the center of mass from
 
 * Foot force difference control [Kajita2010]: the leg that carries too little grows,
   ż = k ((F_l − F_r)_ref − (F_l − F_r)) − z/T, half of z on each side.
-* Feedback of the center of mass: the error of the divergent component of motion ξ = c + ċ/ω asks
-  for a ZMP shift Δp = k (ξ − ξ_ref), which the ankles produce by winding their springs, Δτ/K.
+* Feedback of the center of mass: the error of the divergent component of motion ξ = c + ċ/ω gives a
+  ZMP shift Δp = k (ξ − ξ_ref). The ankles produce it by winding their springs, Δτ/K.
 * Dry friction F of the joints that the plan moves winds the springs too: their motors lead by F/K
   in the direction of the planned rate. F comes from an identification.
 
@@ -114,7 +114,7 @@ class WalkingController(BatchPolicy):
     """
 
     reads_rates = False
-    """It needs no joint rates: the velocity of the center of mass is the change of its position."""
+    """False: the velocity of the center of mass is the change of its position."""
 
     def __init__(
         self,

@@ -89,7 +89,7 @@ def tare_feet(gains: Any, unloaded: Array, observations: Any, memory: Any) -> No
 
     Args:
         gains: Gains and the control period, a row, (1,).
-        unloaded: As of `unloaded_wrench`.
+        unloaded: Result of `unloaded_wrench`.
         observations: Rows with fields, (n,).
         memory: Rows of `TARE`, to be updated, (n,).
     """

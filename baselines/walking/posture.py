@@ -73,7 +73,7 @@ FEEDBACK = record_type(
     tilt=(2,),  # filtered roll and pitch [rad]
     integral=(2,),  # of them [rad·s]
     trim=(2,),  # hip angle against a tilt that stays [rad]
-    kept=(2,),  # hip pitch that a leg in the air keeps, legs [rad]
+    leg_pitch=(2,),  # hip pitch that a leg in the air keeps, legs [rad]
 )
 """Memory of the posture feedback."""
 
@@ -193,8 +193,8 @@ def pitch_of_leg(gains: Any, right: Any, leg: int, turn: float, last: Any, memor
     share = right if leg == 1 else 1.0 - right
     standing = min(2.0 * share, 1.0)
     following = gains.swing_share if standing < 1.0 else 1.0
-    memory.kept[leg] = last.kept[leg] + following * (turn - last.kept[leg])
-    return last.kept[leg] + standing * (turn - last.kept[leg])
+    memory.leg_pitch[leg] = last.leg_pitch[leg] + following * (turn - last.leg_pitch[leg])
+    return last.leg_pitch[leg] + standing * (turn - last.leg_pitch[leg])
 
 
 @compiled_part

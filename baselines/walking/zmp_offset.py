@@ -87,7 +87,7 @@ def integrate(error: Array, rate: float, limit: float, shift: Array, zmp: Array)
         error: Measured less planned ZMP, (n, 2) [m]; nan where the feet carry too little.
         rate: Share of the error that the shift removes in a control period [1].
         limit: Largest shift forward and sideways [m].
-        shift: Of the planned ZMP, (n, 2) [m].
+        shift: Shift of the planned ZMP, (n, 2) [m].
         zmp: To be added to, (n, 2) [m].
     """
     for world in range(len(shift)):
