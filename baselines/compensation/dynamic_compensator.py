@@ -42,10 +42,10 @@ class DriveMemory(NamedTuple):
 class DynamicCompensator(Compensator):
     r"""Deflection from the full joint torque of the motion, and the inverse of the servo.
 
-    The link's inverse dynamics give τ_J; the transmission with its damping, K δ + D δ̇ = τ_J, gives
-    δ; the rotor and the servo, B θ̈ + τ_J = k_p e − k_v θ̇ + k_i ∫e, give the servo error e that
-    the motion θ = q + δ needs. The command is θ + e, taken at the middle of the control period over
-    which it is held.
+    The link's inverse dynamics give τ_J. The transmission with its damping, K δ + D δ̇ = τ_J, gives
+    δ. The rotor and the servo, B θ̈ + τ_J = k_p e − k_v θ̇ + k_i ∫e, give the servo error e for the
+    motion θ = q + δ. The command is θ + e at the middle of the control period over which it is
+    held.
 
     Args:
         model: Assumed robot, with a servo on every joint.

@@ -92,7 +92,7 @@ def read_stiffness(
     for name in joints:
         if name in held:
             raise ConfigurationError(
-                f"joint {name!r} is named by `joints`, and is {HELD} by stiffness; give it a"
+                f"joint {name!r} is named by `joints`, but {HELD} in stiffness; give it a"
                 " stiffness K [N·m/rad], or leave it out of `joints`"
             )
     require_known_torque(model, joints)

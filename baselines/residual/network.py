@@ -47,7 +47,7 @@ def require_network(tensors: Tensors) -> int:
             raise ConfigurationError(f"weight{i} must have the shape {shape}, got {got}")
     std = tensors["std"]
     if std.shape != (widths[0],) or not (std > 0.0).all():
-        raise ConfigurationError(f"std must be {widths[0]} positive values, one per action")
+        raise ConfigurationError(f"std must be {widths[0]} positive values, one per feature")
     return depth
 
 
