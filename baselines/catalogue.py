@@ -127,7 +127,7 @@ def _build_base(env: Any, model: WalkerModel, options: PolicyOptions) -> Any:
 
 
 def _measure_weight(build: Builder) -> Builder:
-    """Builder of a policy whose controller measures the robot's weight, unless gains are given."""
+    """Builder of a policy whose controller measures the weight, unless `gains` set the filter."""
 
     def build_weighing(env: Any, model: WalkerModel, options: PolicyOptions) -> Any:
         gains = options.gains or WalkingGains()
@@ -216,7 +216,7 @@ def _phase_table(env: Any, model: WalkerModel, options: PolicyOptions) -> Any:
 
 
 def _quick_gains(options: PolicyOptions) -> PolicyOptions:
-    """Options with gains that are stable only where feet are held to their footholds."""
+    """Options with quicker feedback, for feet that are held to their footholds."""
     posture = options.posture.model_dump(exclude_unset=True)
     walking = options.gains.model_dump(exclude_unset=True) if options.gains else {}
     return options.replace(
