@@ -88,10 +88,8 @@ class Features:
         self._measured = np.flatnonzero([signal.kind == "measured" for signal in present])
         self._history = settings.history
         commands = model.observation_table.signals_of("last_command")
-        self.signals = (
-            *present,
-            *(rename_group(commands, BASE_ACTION) if self._has_action else ()),
-        )
+        action = rename_group(commands, BASE_ACTION) if self._has_action else ()
+        self.signals = (*present, *action)
         measured = [present[i] for i in self._measured]
         earlier = [
             replace(signal, name=f"{signal.name}@-{k + 1}")
@@ -106,7 +104,7 @@ class Features:
     def begin(self, num_worlds: int) -> FeaturesMemory:
         """Memory before the first decision."""
         past = np.zeros((num_worlds, self._history * len(self._measured)))
-        return FeaturesMemory(past, tuple([source.begin(num_worlds) for source in self._sources]))
+        return FeaturesMemory(past, tuple(source.begin(num_worlds) for source in self._sources))
 
     def at(
         self, rows: Array, memory: Any, is_first: BoolArray, state: Any, episode_start: Any
