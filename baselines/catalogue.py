@@ -1,7 +1,7 @@
-"""The named policies: how each is built, its options, and the sensors that it needs.
+"""The named policies: their builders, options and sensors.
 
 Compensation is a wrapper: `Compensated(policy, compensator)` adds the input compensation to the
-command of a policy and shows it compensated encoder readings. The named policies are such
+command of a policy and gives it compensated encoder readings. The named policies are such
 compositions.
 """
 
@@ -9,20 +9,16 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import partial
-from pathlib import Path
 from typing import Any
 
-from baselines.adaptation.disturbance_observer import LINK_IMU, DisturbanceObserver, ObserverGains
+from baselines.adaptation.disturbance_observer import LINK_IMU, DisturbanceObserver
 from baselines.adaptation.estimators import LegEstimator, make_estimator
-from baselines.adaptation.iterative import IterativeLearner, LearningGains, learned_signals
-from baselines.adaptation.online_stiffness import AdaptationGains, OnlineStiffness
-from baselines.compensation.compensators import (
-    Compensated,
-    DynamicCompensator,
-    GravityCompensator,
-    OutputMethod,
-)
-from baselines.compensation.gravity_torque import GravityMethod
+from baselines.adaptation.iterative import IterativeLearner
+from baselines.adaptation.learned_signals import learned_signals
+from baselines.adaptation.online_stiffness import OnlineStiffness
+from baselines.compensation.compensated import Compensated
+from baselines.compensation.compensators import GravityCompensator
+from baselines.compensation.dynamic_compensator import DynamicCompensator
 from baselines.compensation.measured import (
     LINK_ENCODER,
     TORQUE_SENSOR,
@@ -31,89 +27,20 @@ from baselines.compensation.measured import (
 )
 from baselines.compensation.oracle import Oracle, TrueSensors
 from baselines.compensation.policy import Policy, Zero
+from baselines.policy_options import PolicyOptions
 from baselines.walking.controller import WalkingController, WalkingGains
-from baselines.walking.dcm_observer import DcmObserver, DcmObserverGains
-from baselines.walking.foothold import (
-    FootholdCorrection,
-    FootholdGains,
-    FootTare,
-    FootTareGains,
-    RefinedWalk,
-    refine_model,
-)
-from baselines.walking.mean_zmp import StandingEstimate, StandingGains, ZmpOffset, ZmpOffsetGains
+from baselines.walking.dcm_observer import DcmObserver
+from baselines.walking.foot_tare import FootTare
+from baselines.walking.foothold import FootholdCorrection
 from baselines.walking.phase_table import PhaseFeedforward, load_phase_table
 from baselines.walking.posture import PostureFeedback, PostureGains
-from baselines.walking.published import (
-    FootBalance,
-    FootBalanceGains,
-    HipTorque,
-    HipTorqueGains,
-    StanceRoll,
-    StanceRollGains,
-)
-from elastic_env.core.config import Model, quantity
+from baselines.walking.refined_walk import RefinedWalk, refine_model
+from baselines.walking.standing_estimate import StandingEstimate
+from baselines.walking.talos import HipTorque
+from baselines.walking.thormang import FootBalance, StanceRoll
+from baselines.walking.zmp_offset import ZmpOffset, ZmpOffsetGains
 from elastic_env.core.errors import ConfigurationError, require_known
-from elastic_env.motion.trajectory import STAND_S
 from elastic_env.world.robot_model import RobotModel, WalkerModel
-
-
-class PolicyOptions(Model):
-    """Options of the named policies, as keyword arguments of `baselines.make`."""
-
-    stiffness: Any = None
-    """K that the compensator assumes: a number, a list of one per joint [N·m/rad], or the path of
-    an identification; None for the environment's assumed model."""
-    stiffness_scale: float = quantity("1", 1.0, gt=0)
-    """Further factor on the K that is assumed [1]."""
-    output: OutputMethod | None = None
-    """Output compensator: "taylor" for Eq. 12, "newton" for Eq. 10, on the walker also "wrench" and
-    "none"; None for what the policy's name says."""
-    gravity: GravityMethod | None = None
-    """How τ_g is computed: on the testbed "hinge" or "tree", on the walker "com", "ankle" or
-    "lumped"; None for the first of them."""
-    com_feedback: bool = True
-    """Walker: whether the controller feeds the center of mass back."""
-    gains: WalkingGains | None = None
-    """Walker: gains of the controller, over those that the policy's name stands for."""
-    base: str | None = None
-    """Walker: the compensated policy that a feedback builds on; None for `input_output`, and for
-    `dynamic` where `foothold` builds on it."""
-    adaptation: AdaptationGains = AdaptationGains()
-    """How fast the stiffness is adapted."""
-    posture: PostureGains = PostureGains()
-    """Walker: gains of the posture feedback."""
-    zmp_offset: ZmpOffsetGains | None = None
-    """Walker: how the planned ZMP is shifted against the mean error of the measured one; None
-    for not at all, and for `foothold` with its own time constant.
-    """
-    foothold: FootholdGains = FootholdGains()
-    """Walker: how `foothold` corrects where the feet land."""
-    standing: StandingGains = StandingGains()
-    """Walker: how `foothold` estimates the mean ZMP error of a walk from its standing."""
-    foot_tare: FootTareGains = FootTareGains()
-    """Walker: how `foothold` sets the foot sensors to zero."""
-    dcm_observer: DcmObserverGains = DcmObserverGains()
-    """Walker: filters and bound of `disturbance_observer`."""
-    phase_table: Path | None = None
-    """Walker: file of the table of `phase_table`; None for the package's own of the gait."""
-    stance_roll: StanceRollGains = StanceRollGains()
-    """Walker: hip roll feedforward of `thormang`."""
-    foot_balance: FootBalanceGains = FootBalanceGains()
-    """Walker: gains of the stabiliser of `thormang`."""
-    hip_torque: HipTorqueGains = HipTorqueGains()
-    """Walker: filter, bound and rate limit of `talos`."""
-    observer: ObserverGains = ObserverGains()
-    """Testbed: filters and bound of `disturbance_observer`."""
-    learned_base: str | None = None
-    """The policy whose offsets `iterative` learns; None for `adaptive_posture` on the walker,
-    else `input`.
-    """
-    learning: LearningGains = LearningGains()
-    """How `iterative` learns, and from how many trials."""
-    ramp_s: float = quantity("s", STAND_S, gt=0, le=3600)
-    """Time in which the compensation grows from zero [s]."""
-
 
 Builder = Callable[[Any, Any, PolicyOptions], Any]
 """Builds a policy for an environment, an assumed model and options."""
@@ -145,9 +72,9 @@ class NamedPolicy:
     Attributes:
         build: Builds it.
         options: Names of the `PolicyOptions` that have an effect on it.
-        track: What it needs.
-        sensors: Sensors that it reads beyond the standard set, as `gymnasium.make(...,
-            sensors=[...])` has them.
+        track: Its track of the leaderboard.
+        sensors: Sensors that it reads beyond the standard set, by their names in
+            `gymnasium.make(..., sensors=[...])`.
     """
 
     build: Builder
@@ -160,22 +87,22 @@ def _zero(env: Any, model: RobotModel, options: PolicyOptions) -> Policy:  # noq
     return Zero(model)
 
 
-def _around(core: Builder, compensator: Any, output: Any = "taylor") -> Builder:
-    """A compensator around a policy."""
+def _compensate(core: Builder, compensator: Any, output: Any = "taylor") -> Builder:
+    """Builder of a policy with a compensator around it."""
 
     def build(env: Any, model: RobotModel, options: PolicyOptions) -> Policy:
-        made = compensator(model, options.output or output, options.gravity)
-        return Compensated(core(env, model, options), made, ramp_s=options.ramp_s)
+        around = compensator(model, options.output or output, options.gravity)
+        return Compensated(core(env, model, options), around, ramp_s=options.ramp_s)
 
     return build
 
 
-_friction = _around(_zero, partial(DynamicCompensator, friction=True))
+_friction = _compensate(_zero, partial(DynamicCompensator, friction=True))
 
 
-def _observer(env: Any, model: RobotModel, options: PolicyOptions) -> Policy:
+def _joint_observer(env: Any, model: RobotModel, options: PolicyOptions) -> Policy:
     gains = options.observer
-    build = _friction if gains.friction else _around(_zero, DynamicCompensator)
+    build = _friction if gains.friction else _compensate(_zero, DynamicCompensator)
     return DisturbanceObserver(build(env, model, options), model, gains, options.ramp_s)
 
 
@@ -183,53 +110,52 @@ def _controller(env: Any, model: WalkerModel, options: PolicyOptions) -> Policy:
     return WalkingController(model, options.com_feedback, options.gains, options.ramp_s)
 
 
-def _open(build: Builder) -> Builder:
-    """Without feedback of the center of mass."""
+def _disable_com_feedback(build: Builder) -> Builder:
+    """Builder of a policy without feedback of the center of mass."""
 
-    def built(env: Any, model: RobotModel, options: PolicyOptions) -> Policy:
+    def build_open(env: Any, model: RobotModel, options: PolicyOptions) -> Policy:
         return build(env, model, options.replace(com_feedback=False))
 
-    return built
+    return build_open
 
 
-def _base(env: Any, model: WalkerModel, options: PolicyOptions) -> Any:
-    """The compensated policy that a feedback is built on."""
-    base = options.base or _BASE
+def _build_base(env: Any, model: WalkerModel, options: PolicyOptions) -> Any:
+    """Build the compensated policy inside a feedback."""
+    base = options.base or _DEFAULT_BASE
     require_known("base of a feedback", [base], COMPENSATED)
     return COMPENSATED[base](env, model, options)
 
 
-def _weighing(build: Builder) -> Builder:
-    """With a controller that measures the robot's weight, unless the gains say otherwise."""
+def _measure_weight(build: Builder) -> Builder:
+    """Builder of a policy whose controller measures the weight, unless `gains` set the filter."""
 
-    def built(env: Any, model: WalkerModel, options: PolicyOptions) -> Any:
+    def build_weighing(env: Any, model: WalkerModel, options: PolicyOptions) -> Any:
         gains = options.gains or WalkingGains()
         if "weight_filter_s" not in gains.model_fields_set:
             gains = gains.replace(weight_filter_s=_WEIGHT_FILTER_S)
         return build(env, model, options.replace(gains=gains))
 
-    return built
+    return build_weighing
 
 
-def _adaptive(env: Any, model: WalkerModel, options: PolicyOptions) -> Any:
-    base = _base(env, model, options)
+def _build_adaptive(env: Any, model: WalkerModel, options: PolicyOptions) -> Any:
+    base = _build_base(env, model, options)
     return OnlineStiffness(base, model, LegEstimator(model), options.adaptation)
 
 
-def _with_posture(build: Builder) -> Builder:
-    """With posture feedback, and the planned ZMP shifted against its mean error if asked for."""
+def _add_posture_feedback(build: Builder) -> Builder:
+    """Builder of a policy with posture feedback, and with a ZMP offset where options ask for it."""
 
-    def built(env: Any, model: WalkerModel, options: PolicyOptions) -> Any:
-        inner = build(env, model, options)
-        policy = PostureFeedback(inner, model, options.posture, options.ramp_s)
+    def build_with_feedback(env: Any, model: WalkerModel, options: PolicyOptions) -> Any:
+        policy = PostureFeedback(build(env, model, options), model, options.posture, options.ramp_s)
         if options.zmp_offset is None:
             return policy
         return ZmpOffset(policy, model, options.zmp_offset)
 
-    return built
+    return build_with_feedback
 
 
-_adaptive_posture = _weighing(_with_posture(_adaptive))
+_build_adaptive_posture = _measure_weight(_add_posture_feedback(_build_adaptive))
 
 
 def _oracle(env: Any, model: RobotModel, options: PolicyOptions) -> Policy:
@@ -242,55 +168,55 @@ def _oracle(env: Any, model: RobotModel, options: PolicyOptions) -> Policy:
     true_model = env.unwrapped.truth().model
     if not isinstance(true_model, WalkerModel):
         return Oracle(env, Zero(model), true_model, ramp_s)
-    further = refine_model(true_model)
-    options = _with_quick_gains(options)
-    inner = _controller(env, further, options)
-    policy: Any = Oracle(env, inner, further, ramp_s, friction=False, integral_gain=0.0)
+    refined = refine_model(true_model)
+    options = _quick_gains(options)
+    inner = _controller(env, refined, options)
+    policy: Any = Oracle(env, inner, refined, ramp_s, friction=False, integral_gain=0.0)
     # without friction nothing damps the springs: they ring under a feedback, which is not needed
     if model.coulomb_friction.any():
-        policy = PostureFeedback(policy, further, options.posture, ramp_s)
-        policy = _without_mean_error(policy, further, options)
-        policy = TrueSensors(env, FootholdCorrection(policy, further, options.foothold))
-    return RefinedWalk(policy, true_model, further)
+        policy = PostureFeedback(policy, refined, options.posture, ramp_s)
+        policy = _add_zmp_offset(policy, refined, options)
+        policy = TrueSensors(env, FootholdCorrection(policy, refined, options.foothold))
+    return RefinedWalk(policy, true_model, refined)
 
 
-def _on_refined_walk(build: Builder) -> Builder:
-    """With feet that land as planned, along the refined plan, under its full joint torque."""
+def _refine_walk(build: Builder) -> Builder:
+    """Builder of a policy with corrected footholds on the refined plan, by full joint torque."""
 
-    def built(env: Any, model: WalkerModel, options: PolicyOptions) -> Any:
-        further = refine_model(model)
-        options = _with_quick_gains(options)
+    def build_refined(env: Any, model: WalkerModel, options: PolicyOptions) -> Any:
+        refined = refine_model(model)
+        options = _quick_gains(options)
         if options.base in (None, "dynamic"):
             options = options.replace(base="dynamic", output=options.output or "taylor")
-        policy = build(env, further, options)
-        policy = FootholdCorrection(policy, further, options.foothold)
-        return RefinedWalk(FootTare(policy, further, options.foot_tare), model, further)
+        policy = build(env, refined, options)
+        policy = FootholdCorrection(policy, refined, options.foothold)
+        return RefinedWalk(FootTare(policy, refined, options.foot_tare), model, refined)
 
-    return built
+    return build_refined
 
 
-@_on_refined_walk
+@_refine_walk
 def _foothold(env: Any, model: WalkerModel, options: PolicyOptions) -> Any:
-    """`adaptive_posture` whose ZMP has no mean error."""
-    policy = _adaptive_posture(env, model, options.replace(zmp_offset=None))
-    return _without_mean_error(policy, model, options)
+    """Build `adaptive_posture` whose ZMP has no mean error."""
+    policy = _build_adaptive_posture(env, model, options.replace(zmp_offset=None))
+    return _add_zmp_offset(policy, model, options)
 
 
-@_on_refined_walk
+@_refine_walk
 def _dcm_observer(env: Any, model: WalkerModel, options: PolicyOptions) -> Any:
-    """`foothold` with an observer in the place of standing estimate and ZMP offset."""
-    policy = _adaptive_posture(env, model, options.replace(zmp_offset=None))
+    """Build `foothold` with an observer instead of standing estimate and ZMP offset."""
+    policy = _build_adaptive_posture(env, model, options.replace(zmp_offset=None))
     return DcmObserver(policy, model, options.dcm_observer, options.ramp_s)
 
 
 def _phase_table(env: Any, model: WalkerModel, options: PolicyOptions) -> Any:
-    """`foothold` with what its robots have in common fed forward."""
+    """Build `foothold` with a feedforward over the phase of a step."""
     table = load_phase_table(model.plan.gait.step_period_s, options.phase_table)
     return PhaseFeedforward(_foothold(env, model, options), model, table)
 
 
-def _with_quick_gains(options: PolicyOptions) -> PolicyOptions:
-    """With feedbacks that only feet held to their footholds bear."""
+def _quick_gains(options: PolicyOptions) -> PolicyOptions:
+    """Options with quicker feedback, for feet that are held to their footholds."""
     posture = options.posture.model_dump(exclude_unset=True)
     walking = options.gains.model_dump(exclude_unset=True) if options.gains else {}
     return options.replace(
@@ -298,27 +224,28 @@ def _with_quick_gains(options: PolicyOptions) -> PolicyOptions:
     )
 
 
-def _without_mean_error(policy: Any, model: WalkerModel, options: PolicyOptions) -> Any:
-    """With a ZMP without a mean error."""
+def _add_zmp_offset(policy: Any, model: WalkerModel, options: PolicyOptions) -> Any:
+    """Add a ZMP offset and a standing estimate to a policy, against the mean error of the ZMP."""
     gains = ZmpOffsetGains(time_constant_s=_ZMP_OFFSET_S)
     if options.zmp_offset is not None:
         gains = gains.replace(**options.zmp_offset.model_dump(exclude_unset=True))
     return StandingEstimate(ZmpOffset(policy, model, gains), model, options.standing)
 
 
-_BASE = "input_output"
+_DEFAULT_BASE = "input_output"
 _ZMP_OFFSET_S = 23.0
-"""Time constant of the ZMP offset of `foothold`, whose standing estimate leaves little [s]."""
+"""Time constant of the ZMP offset of `foothold`; its standing estimate leaves a small error [s]."""
 QUICK_POSTURE = PostureGains(
     proportional=2.7, integral=16.0, derivative=0.09, leak_s=0.25, trim=4.0, filter_s=0.008
 )
-"""Found on robots of bank 1, with a test of the margin. Without footholds the feet drift more under
-them than under the default."""
+"""Optimised on robots of bank 1, with a test of the margin. Without the foothold correction the
+feet drift more with them than with the defaults."""
 _WEIGHT_FILTER_S = 1.0
+"""Time constant of the measured weight [s]."""
 QUICK_WALKING = WalkingGains(
     dcm=0.5, velocity_filter_s=0.04, zmp_filter_s=0.02, weight_filter_s=_WEIGHT_FILTER_S
 )
-"""Found together with `QUICK_POSTURE`."""
+"""Optimised together with `QUICK_POSTURE`."""
 
 
 def learned_base(options: PolicyOptions, is_walker: bool) -> str:
@@ -330,25 +257,23 @@ def learned_base(options: PolicyOptions, is_walker: bool) -> str:
     return name
 
 
-def _iterative(env: Any, model: RobotModel, options: PolicyOptions) -> Any:
+def _build_iterative(env: Any, model: RobotModel, options: PolicyOptions) -> Any:
     is_walker = isinstance(model, WalkerModel)
-    # offsets that are learned turn both legs; a leg that keeps its own pitch lets the ZMP drift
-    # away over the walks
+    # learned offsets turn both legs; if a leg keeps its own pitch, the ZMP drifts over the walks
     if "swing_s" not in options.posture.model_fields_set:
         given = options.posture.model_dump(exclude_unset=True)
         options = options.replace(posture=PostureGains(**given, swing_s=0.0))
-    known = policies_of(is_walker)[learned_base(options, is_walker)]
-    base = known.build(env, model, options)
+    base = policies_of(is_walker)[learned_base(options, is_walker)].build(env, model, options)
     signals = learned_signals(model, options.learning)
     learner = IterativeLearner(base, model, signals, options.ramp_s)
     learner.trials = options.learning.trials
     return learner
 
 
-def _measured(
+def _sensor_policy(
     sensor: str, options: tuple[str, ...], joints: tuple[str, ...] = ("",)
 ) -> NamedPolicy:
-    """`dynamic` with the deflections of some joints by sensors, which also adapt the stiffness."""
+    """Variant of `dynamic` with deflections by sensors of some joints, which also adapt K."""
 
     def build(env: Any, model: RobotModel, options: PolicyOptions) -> Any:
         is_walker = isinstance(model, WalkerModel)
@@ -358,10 +283,9 @@ def _measured(
         compensator = MeasuredCompensator(model, sensors, output, options.gravity)
         inner = core(env, model, options)
         policy = Compensated(inner, compensator, options.ramp_s, corrects_policy=True)
-        estimator = make_estimator(model, sensors)
-        return OnlineStiffness(policy, model, estimator, options.adaptation)
+        return OnlineStiffness(policy, model, make_estimator(model, sensors), options.adaptation)
 
-    return NamedPolicy(_weighing(build), options, TRACK_OF_SENSOR[sensor], (sensor,))
+    return NamedPolicy(_measure_weight(build), options, TRACK_OF_SENSOR[sensor], (sensor,))
 
 
 def _thormang(env: Any, model: WalkerModel, options: PolicyOptions) -> Policy:  # noqa: ARG001
@@ -374,70 +298,89 @@ def _talos(env: Any, model: WalkerModel, options: PolicyOptions) -> Policy:
 
 
 COMPENSATED: Mapping[str, Builder] = {
-    "input": _around(_controller, GravityCompensator, "none"),
-    "input_output": _around(_controller, GravityCompensator, "taylor"),
-    "input_wrench": _around(_controller, GravityCompensator, "wrench"),
-    "dynamic": _around(_controller, DynamicCompensator, "wrench"),
+    "input": _compensate(_controller, GravityCompensator, "none"),
+    "input_output": _compensate(_controller, GravityCompensator, "taylor"),
+    "input_wrench": _compensate(_controller, GravityCompensator, "wrench"),
+    "dynamic": _compensate(_controller, DynamicCompensator, "wrench"),
 }
-"""Compensated policies of a walker, which a feedback can build on."""
-
+"""Compensated policies of a walker, on which a feedback can build."""
 ASSUMED_OPTIONS = ("stiffness", "stiffness_scale")
-"""Options that say what a policy assumes of the joints."""
-_COMPENSATOR = (*ASSUMED_OPTIONS, "output", "gravity", "ramp_s")
-_CONTROLLER = ("gains", "com_feedback", "ramp_s")
-_COMPENSATED = (*_COMPENSATOR, "gains", "com_feedback")
-_ADAPTIVE = (*_COMPENSATED, "base", "adaptation")
-_POSTURE = ("posture", "zmp_offset")
-_FOOTHOLD = ("foothold", "standing", "foot_tare")
-_LEARNED = ("learned_base", "learning")
-_PUBLISHED = ("stance_roll", "foot_balance", "ramp_s")
-_TALOS = (*ASSUMED_OPTIONS, *_CONTROLLER, "hip_torque")
-
+"""Options for the assumed stiffness of the joints."""
+_COMPENSATOR_OPTIONS = (*ASSUMED_OPTIONS, "output", "gravity", "ramp_s")
+_CONTROLLER_OPTIONS = ("gains", "com_feedback", "ramp_s")
+_COMPENSATED_OPTIONS = (*_COMPENSATOR_OPTIONS, "gains", "com_feedback")
+_ADAPTIVE_OPTIONS = (*_COMPENSATED_OPTIONS, "base", "adaptation")
+_POSTURE_OPTIONS = ("posture", "zmp_offset")
+_FOOTHOLD_OPTIONS = ("foothold", "standing", "foot_tare")
+_LEARNING_OPTIONS = ("learned_base", "learning")
+_THORMANG_OPTIONS = ("stance_roll", "foot_balance", "ramp_s")
+_TALOS_OPTIONS = (*ASSUMED_OPTIONS, *_CONTROLLER_OPTIONS, "hip_torque")
 ON_JOINTS: Mapping[str, NamedPolicy] = {
     "zero": NamedPolicy(_zero),
     "uncompensated": NamedPolicy(_zero),
-    "input": NamedPolicy(_around(_zero, GravityCompensator), _COMPENSATOR),
-    "dynamic": NamedPolicy(_around(_zero, DynamicCompensator), _COMPENSATOR),
-    "friction": NamedPolicy(_friction, _COMPENSATOR),
+    "input": NamedPolicy(_compensate(_zero, GravityCompensator), _COMPENSATOR_OPTIONS),
+    "dynamic": NamedPolicy(_compensate(_zero, DynamicCompensator), _COMPENSATOR_OPTIONS),
+    "friction": NamedPolicy(_friction, _COMPENSATOR_OPTIONS),
     "disturbance_observer": NamedPolicy(
-        _observer, (*_COMPENSATOR, "observer"), TRACK_OF_SENSOR[LINK_IMU], (LINK_IMU,)
+        _joint_observer,
+        (*_COMPENSATOR_OPTIONS, "observer"),
+        TRACK_OF_SENSOR[LINK_IMU],
+        (LINK_IMU,),
     ),
-    "link_encoder": _measured(LINK_ENCODER, (*_COMPENSATOR, "adaptation")),
-    "iterative": NamedPolicy(_iterative, (*_COMPENSATOR, *_LEARNED), Track.WALKS),
+    "link_encoder": _sensor_policy(LINK_ENCODER, (*_COMPENSATOR_OPTIONS, "adaptation")),
+    "iterative": NamedPolicy(
+        _build_iterative, (*_COMPENSATOR_OPTIONS, *_LEARNING_OPTIONS), Track.WALKS
+    ),
     "oracle": NamedPolicy(_oracle, ("ramp_s",), Track.TRUTH),
 }
 """Policies of robots on a fixed base.
 
-There `uncompensated` has no controller to add and equals `zero`.
+There is no controller, so that `uncompensated` equals `zero`.
 """
-
 ON_THE_WALKER: Mapping[str, NamedPolicy] = {
     "zero": NamedPolicy(_zero),
-    "uncompensated_open": NamedPolicy(_open(_controller), (*ASSUMED_OPTIONS, "gains", "ramp_s")),
-    "uncompensated": NamedPolicy(_controller, (*ASSUMED_OPTIONS, *_CONTROLLER)),
-    "input_open": NamedPolicy(_open(COMPENSATED["input"]), (*_COMPENSATOR, "gains")),
-    **{name: NamedPolicy(build, _COMPENSATED) for name, build in COMPENSATED.items()},
-    "adaptive": NamedPolicy(_weighing(_adaptive), _ADAPTIVE),
-    "posture": NamedPolicy(_with_posture(_base), (*_COMPENSATED, "base", *_POSTURE)),
-    "adaptive_posture": NamedPolicy(_adaptive_posture, (*_ADAPTIVE, *_POSTURE)),
-    "foothold": NamedPolicy(_foothold, (*_ADAPTIVE, *_POSTURE, *_FOOTHOLD)),
+    "uncompensated_open": NamedPolicy(
+        _disable_com_feedback(_controller), (*ASSUMED_OPTIONS, "gains", "ramp_s")
+    ),
+    "uncompensated": NamedPolicy(_controller, (*ASSUMED_OPTIONS, *_CONTROLLER_OPTIONS)),
+    "input_open": NamedPolicy(
+        _disable_com_feedback(COMPENSATED["input"]), (*_COMPENSATOR_OPTIONS, "gains")
+    ),
+    **{name: NamedPolicy(build, _COMPENSATED_OPTIONS) for name, build in COMPENSATED.items()},
+    "adaptive": NamedPolicy(_measure_weight(_build_adaptive), _ADAPTIVE_OPTIONS),
+    "posture": NamedPolicy(
+        _add_posture_feedback(_build_base), (*_COMPENSATED_OPTIONS, "base", *_POSTURE_OPTIONS)
+    ),
+    "adaptive_posture": NamedPolicy(
+        _build_adaptive_posture, (*_ADAPTIVE_OPTIONS, *_POSTURE_OPTIONS)
+    ),
+    "foothold": NamedPolicy(_foothold, (*_ADAPTIVE_OPTIONS, *_POSTURE_OPTIONS, *_FOOTHOLD_OPTIONS)),
     "disturbance_observer": NamedPolicy(
-        _dcm_observer, (*_ADAPTIVE, "posture", "foothold", "foot_tare", "dcm_observer")
+        _dcm_observer,
+        (*_ADAPTIVE_OPTIONS, "posture", "foothold", "foot_tare", "dcm_observer"),
     ),
     "phase_table": NamedPolicy(
-        _phase_table, (*_ADAPTIVE, *_POSTURE, *_FOOTHOLD, "phase_table"), Track.TRAINING
+        _phase_table,
+        (*_ADAPTIVE_OPTIONS, *_POSTURE_OPTIONS, *_FOOTHOLD_OPTIONS, "phase_table"),
+        Track.TRAINING,
     ),
-    "torque_sensor": _measured(TORQUE_SENSOR, (*_COMPENSATED, "adaptation")),
-    "hip_sensor": _measured(LINK_ENCODER, (*_COMPENSATED, "adaptation"), ("hip",)),
-    "link_encoder": _measured(LINK_ENCODER, (*_COMPENSATED, "adaptation")),
-    "thormang": NamedPolicy(_thormang, _PUBLISHED),
-    "talos": NamedPolicy(_talos, _TALOS, Track.TORQUE_SENSORS, (TORQUE_SENSOR,)),
-    "iterative": NamedPolicy(_iterative, (*_ADAPTIVE, "posture", *_LEARNED), Track.WALKS),
-    "oracle": NamedPolicy(_oracle, (*_CONTROLLER, *_POSTURE, "foothold", "standing"), Track.TRUTH),
+    "torque_sensor": _sensor_policy(TORQUE_SENSOR, (*_COMPENSATED_OPTIONS, "adaptation")),
+    "hip_sensor": _sensor_policy(LINK_ENCODER, (*_COMPENSATED_OPTIONS, "adaptation"), ("hip",)),
+    "link_encoder": _sensor_policy(LINK_ENCODER, (*_COMPENSATED_OPTIONS, "adaptation")),
+    "thormang": NamedPolicy(_thormang, _THORMANG_OPTIONS),
+    "talos": NamedPolicy(_talos, _TALOS_OPTIONS, Track.TORQUE_SENSORS, (TORQUE_SENSOR,)),
+    "iterative": NamedPolicy(
+        _build_iterative, (*_ADAPTIVE_OPTIONS, "posture", *_LEARNING_OPTIONS), Track.WALKS
+    ),
+    "oracle": NamedPolicy(
+        _oracle,
+        (*_CONTROLLER_OPTIONS, *_POSTURE_OPTIONS, "foothold", "standing"),
+        Track.TRUTH,
+    ),
 }
 """Policies of the walker.
 
-The controller alone assumes K too, for the ankles' offsets and the friction.
+The controller assumes K too, for the ankles' offsets and the friction.
 """
 
 
@@ -447,8 +390,8 @@ def policies_of(is_walker: bool) -> Mapping[str, NamedPolicy]:
 
 
 BEST_ON_THE_WALKER: str | None = "foothold"
-"""Best policy of the walker that needs no training and reads the standard sensors; residuals are
-compared with it.
+"""Best policy of the walker without training and with the standard sensors; comparisons of
+residuals use it.
 """
 BEST_ON_JOINTS: str | None = "friction"
 """The same for robots on a fixed base."""

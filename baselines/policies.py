@@ -1,9 +1,10 @@
-"""The baselines by name; `baselines.catalogue` says how each is built."""
+"""The baselines by name; `baselines.catalogue` has their builders."""
 
 from pathlib import Path
 from typing import Any
 
-from baselines.adaptation.iterative import LearnedOffsets, learned_signals
+from baselines.adaptation.iterative import LearnedOffsets
+from baselines.adaptation.learned_signals import learned_signals
 from baselines.adaptation.offset_folder import load_table
 from baselines.catalogue import (
     ASSUMED_OPTIONS,
@@ -11,20 +12,21 @@ from baselines.catalogue import (
     BEST_ON_THE_WALKER,
     ON_JOINTS,
     ON_THE_WALKER,
-    PolicyOptions,
     Track,
     policies_of,
 )
 from baselines.compensation.policy import Policy
+from baselines.policy_options import PolicyOptions
 from baselines.residual.correction import Corrected
-from baselines.residual.residual_policy import ResidualPolicy, load_residual
+from baselines.residual.residual_folder import load_residual
+from baselines.residual.residual_policy import ResidualPolicy
 from baselines.residual.settings import RESIDUAL
 from baselines.residual.true_robot import truth_of
 from elastic_env.core.errors import ConfigurationError, shorten, unknown_name
 from elastic_env.world.robot_model import RobotModel, WalkerModel, read_stiffness
 
 ITERATIVE = "iterative:"
-"""Before the folder of what `iterative` has learned, where policies are named."""
+"""Prefix of a folder of learned offsets, in names of policies."""
 
 
 def is_saved(name: str) -> bool:
@@ -43,26 +45,23 @@ def track(name: str, is_walker: bool = True) -> Track:
         return Track.TRAINING
     if name.startswith(ITERATIVE):
         return Track.WALKS
-    known = policies_of(is_walker).get(name)
-    return Track.STANDARD if known is None else known.track
+    named = policies_of(is_walker).get(name)
+    return Track.STANDARD if named is None else named.track
 
 
 def best_analytic(is_walker: bool = True) -> str | None:
-    """The best policy without learning that reads the standard sensors, by its name.
-
-    None where none is named.
-    """
+    """Name of the best policy without learning and with the standard sensors; None without one."""
     return BEST_ON_THE_WALKER if is_walker else BEST_ON_JOINTS
 
 
 def sensors_needed(name: str, is_walker: bool = True) -> tuple[str, ...]:
     """Sensors beyond the standard set that a policy reads, for the argument `sensors`."""
-    known = policies_of(is_walker).get(name)
-    return () if known is None else known.sensors
+    named = policies_of(is_walker).get(name)
+    return () if named is None else named.sensors
 
 
 def make(name: str, env: Any, /, **options: Any) -> Policy:
-    """A named baseline for an environment.
+    """Make a named baseline for an environment.
 
     | name | on the testbed | on the walker |
     |---|---|---|
@@ -70,15 +69,15 @@ def make(name: str, env: Any, /, **options: Any) -> Policy:
     | `uncompensated` | the same | walking controller alone; it takes motors for links |
     | `input` | Eq. 9 on the command, Eq. 12 (or Newton) on the encoder | Eq. 9 around the controller |
     | `input_output` | – | and Eq. 12: the controller sees the estimated links |
-    | `input_wrench` | – | the estimate takes the measured foot wrenches, not the planned share |
+    | `input_wrench` | – | the estimate uses the measured foot wrenches, not the planned share |
     | `dynamic` | full joint torque with D; servo with B inverted | the same, links as `input_wrench` |
     | `friction` | `dynamic`, and the model's Coulomb friction fed forward | – |
-    | `disturbance_observer` | `friction`, and the torque that the link's IMU finds missing | `foothold`, mean ZMP error by a DCM observer |
+    | `disturbance_observer` | `friction`, and the torque that the model lacks by the link's IMU | `foothold`, mean ZMP error by a DCM observer |
     | `adaptive` | – | `input_output`, stiffness of each leg and weight estimated online |
     | `posture` | – | `input_output` with the pelvis' attitude fed back to the hips |
     | `adaptive_posture` | – | both |
     | `foothold` | – | and feet that land as planned: the strongest with the standard sensors |
-    | `phase_table` | – | `foothold`, what robots have in common led by the phase of the step |
+    | `phase_table` | – | `foothold`, and a feedforward over the phase of the step |
     | `torque_sensor` | – | deflections by joint torque sensors, K⁻¹ τ_J |
     | `link_encoder` | `dynamic`, K of each joint by link encoders | deflections by link encoders |
     | `hip_sensor` | – | the same at the hips alone |
@@ -90,15 +89,15 @@ def make(name: str, env: Any, /, **options: Any) -> Policy:
     | `uncompensated_open`, `input_open` | – | without feedback of the center of mass |
     | `residual:PATH` | a trained residual on its base: a folder, or a shipped name | the same |
 
-    `iterative` has a method `rehearse(env, seed)`, which plays the trials that it learns from, each
-    world on its own robot. Until then it is its base. Evaluations call it before they score.
+    `iterative` has a method `rehearse(env, seed)`, which plays its trials, each world on its own
+    robot. Before that it equals its base. Evaluations call it before they score.
 
     Args:
-        name: As in the table.
+        name: Name in the table.
         env: The environment, scalar or vector, wrapped or not; it provides the assumed model.
-        **options: Parameters of `PolicyOptions`, such as stiffness, output, gravity, com_feedback,
-            gains, those that have an effect on this policy in this environment; None is as if it
-            were not given.
+        **options: Parameters of `PolicyOptions` that have an effect on this policy in this
+            environment, such as stiffness, output, gravity, com_feedback, gains; None counts as not
+            given.
 
     Returns:
         An object with `predict`, usable on scalar and vector environments and in SB3's
@@ -122,16 +121,16 @@ def make(name: str, env: Any, /, **options: Any) -> Policy:
     given = {option: value for option, value in options.items() if value is not None}
     chosen = PolicyOptions(**given)
     is_walker = isinstance(env.unwrapped.assumed_model, WalkerModel)
-    known = policies_of(is_walker).get(name)
-    if known is None:
+    named = policies_of(is_walker).get(name)
+    if named is None:
         names = [*policies_of(is_walker), f"{RESIDUAL}PATH", "module:function"]
         raise unknown_name(f"policy of the {env.unwrapped.task.name}", name, names)
-    _require_effect(name, env, given, known.options)
-    return known.build(env, _assumed(env, chosen), chosen)
+    _require_effect(name, env, given, named.options)
+    return named.build(env, _assumed_model(env, chosen), chosen)
 
 
 def _residual_policy(folder: Path, env: Any, options: dict[str, Any]) -> Policy:
-    """A trained residual around its base, whose options may be given anew."""
+    """Load a trained residual around its base; options replace those of the base."""
     description, network = load_residual(folder)
     task = env.unwrapped.task.name
     if description.robot != task:
@@ -144,27 +143,27 @@ def _residual_policy(folder: Path, env: Any, options: dict[str, Any]) -> Policy:
         has = f"the environment's has {', '.join(joints)}"
         raise ConfigurationError(f"{shorten(folder)} was trained on {trained}; {has}")
     base = make(description.base, env, **{**description.base_options, **options})
-    corrected = Corrected(base, model, description.settings, truth_of(env))
-    return ResidualPolicy(corrected, network)
+    return ResidualPolicy(Corrected(base, model, description.settings, truth_of(env)), network)
 
 
 def _learned_policy(folder: Path, env: Any, options: dict[str, Any]) -> Policy:
-    """Learned offsets around their base, whose options may be given."""
+    """Load learned offsets around their base, with options for the base."""
     description, table = load_table(folder, env)
     model: RobotModel = env.unwrapped.assumed_model
     base = make(description.base, env, **options)
     signals = learned_signals(model, description.learning)
-    played = LearnedOffsets(base, model, signals, PolicyOptions().ramp_s)
-    played.play(table[None])
-    return played
+    policy = LearnedOffsets(base, model, signals, PolicyOptions().ramp_s)
+    policy.play(table[None])
+    return policy
 
 
 def _require_effect(name: str, env: Any, given: Any, usable: tuple[str, ...]) -> None:
+    """Refuse options without effect on a policy."""
     listed = ", ".join(usable)
     takes = f"its options are: {listed}" if usable else "it has no options"
     for option in given:
         if option not in usable:
-            # of those with options the oracle alone assumes no stiffness
+            # of the policies with options only the oracle assumes no stiffness
             is_true = bool(usable) and option in ASSUMED_OPTIONS
             why = f"{option} but knows the true one" if is_true else option
             task = env.unwrapped.task.name
@@ -173,7 +172,7 @@ def _require_effect(name: str, env: Any, given: Any, usable: tuple[str, ...]) ->
             )
 
 
-def _assumed(env: Any, options: PolicyOptions) -> RobotModel:
+def _assumed_model(env: Any, options: PolicyOptions) -> RobotModel:
     model: RobotModel = env.unwrapped.assumed_model
     if options.stiffness is not None:
         model = model.with_stiffness(read_stiffness(options.stiffness))

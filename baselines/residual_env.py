@@ -1,9 +1,9 @@
 """Environments in which an agent decides the residual of a base policy, for one world and for many.
 
 A step is a decision: the residual is held for `decision_period` control steps behind its low-pass,
-the base policy commands the robot, rewards are summed, and the next observation is that of the next
-decision. A world that ends inside a decision takes no further part in it: its observation and
-reward are those up to its end.
+the base policy commands the robot, and rewards are summed. The step returns the observation for the
+next decision. A world that ends within a decision stops: its observation and reward are up to its
+end.
 """
 
 from collections.abc import Mapping, Sequence
@@ -17,7 +17,8 @@ from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
-from baselines.compensation.policy import Policy, put_rows, select_rows
+from baselines.compensation.memory import put_rows, select_rows
+from baselines.compensation.policy import Policy
 from baselines.policies import make
 from baselines.residual.correction import Corrected
 from baselines.residual.features import Features, FeaturesMemory
@@ -29,7 +30,7 @@ from elastic_env.world.envs import final_of, reset_mask
 from elastic_env.world.task import Transition
 
 
-class _Deciding:
+class _DecisionLoop:
     """Base policy, correction and features of some worlds, and their memories."""
 
     def __init__(
@@ -50,52 +51,46 @@ class _Deciding:
         self.corrected = Corrected(policy, model, self.settings, truth_of(env))
         self.features = Features(self.corrected)
         self._critic = CriticView(critic_sees, self.corrected) if critic_sees else None
-        further = 0 if self._critic is None else self._critic.width
-        seen = (self.features.width + further,)
-        decided = (self.corrected.num_residuals,)
-        self.observation_space = Box(-np.inf, np.inf, seen, np.float64)
-        self.action_space = Box(-1.0, 1.0, decided, np.float32)
-        self._start = self._fresh = np.zeros(num_worlds, dtype=np.bool_)
+        width = self.features.width + (0 if self._critic is None else self._critic.width)
+        self.observation_space = Box(-np.inf, np.inf, (width,), np.float64)
+        self.action_space = Box(-1.0, 1.0, (self.corrected.num_residuals,), np.float32)
+        # worlds whose episode begins: for the policy, and for the features
+        self._start = self._is_new = np.zeros(num_worlds, dtype=np.bool_)
         self._state: Any = None
         self._past: FeaturesMemory | None = None
 
     def begin(self, worlds: BoolArray) -> None:
-        """Episodes begin in some worlds, a (num_worlds,) mask."""
+        """Begin episodes in some worlds, a (num_worlds,) mask."""
         self._start = self._start | worlds
-        self._fresh = self._fresh | worlds
+        self._is_new = self._is_new | worlds
         if worlds.all():
             self._state = self._past = None
 
     def observe(self, rows: Array, worlds: BoolArray | None = None) -> Array:
-        """Features of the coming decision.
-
-        The measurements count for some worlds only, or for all.
-        """
-        policy = (self._state, self._start)
-        features, past = self.features.at(rows, self._past, self._fresh, *policy)
+        """Features of the coming decision; only some worlds remember the measurements, or all."""
+        features, past = self.features.at(rows, self._past, self._is_new, self._state, self._start)
         if worlds is not None and self._past is not None:
             past = put_rows(self._past, worlds, select_rows(past, worlds))
         self._past = past
-        self._fresh = self._fresh & (False if worlds is None else ~worlds)
+        self._is_new = self._is_new & (False if worlds is None else ~worlds)
         if self._critic is None:
             return features
         return np.hstack([features, self._critic.at(rows)])
 
     def act(self, observation: Array, residual: Array) -> npt.NDArray[np.float32]:
         """Commands of the corrected base for a control step."""
-        policy = (self._state, self._start)
-        action, self._state = self.corrected.act(observation, residual, *policy)
+        action, self._state = self.corrected.act(observation, residual, self._state, self._start)
         self._start = np.zeros_like(self._start)
         return action
 
     def read_residual(self, rows: Array, residual: Any, space: Any) -> Array:
-        """A residual for the observations of its decision, clipped and out of the mirror."""
+        """Check a residual for the observations of its decision, clip it and turn it back."""
         shape = space.shape
-        given = np.asarray(residual, dtype=np.float64)
-        if given.shape != shape or not np.isfinite(given).all():
+        values = np.asarray(residual, dtype=np.float64)
+        if values.shape != shape or not np.isfinite(values).all():
             needed = f"finite numbers of shape {shape} within ±1"
             raise ActionError(f"a residual must be {needed}, got {quote(residual)}")
-        clipped = np.clip(given, -1.0, 1.0).reshape(len(rows), -1)
+        clipped = np.clip(values, -1.0, 1.0).reshape(len(rows), -1)
         return self.features.turn_back(rows, clipped).reshape(shape)
 
 
@@ -105,9 +100,8 @@ class ResidualWrapper(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorAr
     Args:
         env: An environment of ours.
         base_policy: A policy for it, or the name of one.
-        **settings: Parameters of `ResidualSettings`, such as `acts_on`, the inputs of the base that
-            the residual acts on with their bounds, and `decision_period`, the control steps of a
-            decision.
+        **settings: Parameters of `ResidualSettings`, such as `acts_on`, inputs of the base with
+            bounds for the residual, and `decision_period`, the control steps of a decision.
 
     Raises:
         ConfigurationError: Settings that are not valid, or that this base cannot have.
@@ -118,11 +112,11 @@ class ResidualWrapper(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorAr
     ) -> None:
         RecordConstructorArgs.__init__(self, base_policy=base_policy, **settings)
         gymnasium.Wrapper.__init__(self, env)
-        self._deciding = _Deciding(env, base_policy, settings, num_worlds=1)
-        self.settings = self._deciding.settings
-        """How the residual acts."""
-        self.observation_space = self._deciding.observation_space
-        self.action_space = self._deciding.action_space
+        self._loop = _DecisionLoop(env, base_policy, settings, num_worlds=1)
+        self.settings = self._loop.settings
+        """Settings of the residual."""
+        self.observation_space = self._loop.observation_space
+        self.action_space = self._loop.action_space
         self._last = np.zeros(0)
 
     def reset(
@@ -130,26 +124,25 @@ class ResidualWrapper(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorAr
     ) -> tuple[Any, dict[str, Any]]:
         """Begin an episode."""
         self._last, info = self.env.reset(seed=seed, options=options)
-        self._deciding.begin(np.ones(1, dtype=np.bool_))
-        return self._deciding.observe(self._last[None])[0], info
+        self._loop.begin(np.ones(1, dtype=np.bool_))
+        return self._loop.observe(self._last[None])[0], info
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """One decision."""
         if not self._last.size:
             raise gymnasium.error.ResetNeeded("reset() comes before the first step()")
-        rows = self._last[None]
-        residual = self._deciding.read_residual(rows, action, self.action_space)[None]
+        residual = self._loop.read_residual(self._last[None], action, self.action_space)[None]
         total = 0.0
         terminated = False
         truncated = False
         info = {}
         for _ in range(self.settings.decision_period):
-            command = self._deciding.act(self._last[None], residual)[0]
+            command = self._loop.act(self._last[None], residual)[0]
             self._last, reward, terminated, truncated, info = self.env.step(command)
             total += float(reward)
             if terminated or truncated:
                 break
-        features = self._deciding.observe(self._last[None])[0]
+        features = self._loop.observe(self._last[None])[0]
         return features, total, terminated, truncated, info
 
 
@@ -161,9 +154,9 @@ class ResidualVectorWrapper(gymnasium.vector.VectorWrapper[Any, Any, Any]):
     Args:
         env: A vector environment of ours.
         base_policy: A policy for it, or the name of one.
-        autoreset_mode: When it restarts them; None as the environment would.
-        critic_sees: Truth that stands behind the features of the residual, for a critic alone.
-        **settings: As of `ResidualWrapper`.
+        autoreset_mode: Time at which it restarts worlds; None for the mode of the environment.
+        critic_sees: Truth in further columns after the features of the residual, for a critic only.
+        **settings: As in `ResidualWrapper`.
 
     Raises:
         ConfigurationError: Settings that are not valid, or that this base cannot have.
@@ -178,16 +171,16 @@ class ResidualVectorWrapper(gymnasium.vector.VectorWrapper[Any, Any, Any]):
         **settings: Any,
     ) -> None:
         super().__init__(env)
-        self._deciding = _Deciding(env, base_policy, settings, env.num_envs, critic_sees)
-        self.actor_features = self._deciding.features.width
-        """Columns of the observation that the residual decides by, the first ones."""
+        self._loop = _DecisionLoop(env, base_policy, settings, env.num_envs, critic_sees)
+        self.actor_features = self._loop.features.width
+        """Number of features of the residual, which are the first columns of the observation."""
         inner: Any = env.unwrapped
         self.autoreset_mode = autoreset_mode or inner.autoreset_mode
-        self.settings = self._deciding.settings
-        """How the residual acts."""
+        self.settings = self._loop.settings
+        """Settings of the residual."""
         n = env.num_envs
-        self.single_observation_space = self._deciding.observation_space
-        self.single_action_space = self._deciding.action_space
+        self.single_observation_space = self._loop.observation_space
+        self.single_action_space = self._loop.action_space
         self.observation_space = batch_space(self.single_observation_space, n)
 
         self.action_space = batch_space(self.single_action_space, n)
@@ -205,23 +198,22 @@ class ResidualVectorWrapper(gymnasium.vector.VectorWrapper[Any, Any, Any]):
     def reset(
         self, *, seed: Any = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Begin an episode in every world, or in those of options["reset_mask"]."""
+        """Begin an episode in every world, or in the worlds of options["reset_mask"]."""
         self._rows, info = self.env.reset(seed=seed, options=options)
         mask = reset_mask(options, self.num_envs)
-        self._deciding.begin(mask)
+        self._loop.begin(mask)
         self._done = self._done & ~mask
-        features = self._deciding.observe(self._rows, mask)
+        features = self._loop.observe(self._rows, mask)
         if self._last is not None:
             features = np.where(mask[:, None], features, self._last)
         self._last = features
         return self._last.copy(), info
 
     def stagger(self, generator: np.random.Generator) -> None:
-        """Cut the first episodes at decisions spread evenly over their fewest, in random order.
+        """Cut the first episodes at decisions spread evenly over an episode, in random order.
 
-        Call it after `reset`. From the end of the first whole episode on the worlds are all over
-        it; learning that saw all worlds in the same phase would see one phase at a time. What is
-        cut counts as truncated, and has no metrics.
+        Call it after `reset`. Then worlds are in different phases of an episode: without it
+        learning would see one phase at a time. A cut episode is truncated, and has no metrics.
         """
         env: Any = self.env.unwrapped
         length = -(-env.task.fewest_control_steps // self.settings.decision_period)
@@ -233,7 +225,7 @@ class ResidualVectorWrapper(gymnasium.vector.VectorWrapper[Any, Any, Any]):
         """One decision in every world."""
         if self._last is None:
             raise gymnasium.error.ResetNeeded("reset() comes before the first step()")
-        residual = self._deciding.read_residual(self._rows, actions, self.action_space)
+        residual = self._loop.read_residual(self._rows, actions, self.action_space)
         waiting = self._done & (self.autoreset_mode is AutoresetMode.NEXT_STEP)
         features, reward, terminated, truncated, info = self._decide(residual, ~waiting)
         self._decisions += 1
@@ -252,15 +244,11 @@ class ResidualVectorWrapper(gymnasium.vector.VectorWrapper[Any, Any, Any]):
         """Features with those of new episodes in some worlds."""
         self._rows, _ = self.env.reset(options={"reset_mask": worlds})
         self._done = self._done & ~worlds
-        self._deciding.begin(worlds)
-        begun = self._deciding.observe(self._rows, worlds)
-        return np.where(worlds[:, None], begun, features)
+        self._loop.begin(worlds)
+        return np.where(worlds[:, None], self._loop.observe(self._rows, worlds), features)
 
     def _decide(self, residual: Array, alive: BoolArray) -> Transition:
-        """Hold a residual for a decision period in the worlds that are alive.
-
-        The observation is of features.
-        """
+        """Hold a residual for a decision period in the worlds that are alive; observe features."""
         n = self.num_envs
         reward = np.zeros(n)
         terminated = np.zeros(n, dtype=np.bool_)
@@ -269,14 +257,14 @@ class ResidualVectorWrapper(gymnasium.vector.VectorWrapper[Any, Any, Any]):
         metrics: dict[str, Any] = {}
         reason = np.full(n, "", dtype="<U16")
         for _ in range(self.settings.decision_period):
-            action = self._deciding.act(self._rows, residual)
+            action = self._loop.act(self._rows, residual)
             command = np.where(alive[:, None], action, np.float32(0.0))
-            self._rows, gained, fell, finished, info = self._step(command)
-            reward += np.where(alive, gained, 0.0)
+            self._rows, step_reward, fell, finished, info = self._step(command)
+            reward += np.where(alive, step_reward, 0.0)
             ended = alive & (fell | finished)
             if ended.any():
-                # what they see last, with the memories as they are now: the others go on
-                last = self._deciding.observe(self._rows, ended)
+                # their last observation, with the present memories: the others go on
+                last = self._loop.observe(self._rows, ended)
                 final = last if final is None else np.where(ended[:, None], last, final)
                 terminated = terminated | (ended & fell)
                 truncated = truncated | (ended & finished)
@@ -291,16 +279,13 @@ class ResidualVectorWrapper(gymnasium.vector.VectorWrapper[Any, Any, Any]):
         info = {"termination": reason}
         if metrics:
             info |= {"episode_metrics": metrics, "_episode_metrics": done}
-        features = self._deciding.observe(self._rows, ~done)
+        features = self._loop.observe(self._rows, ~done)
         if final is not None:
             features = np.where(done[:, None], final, features)
         return Transition(features, reward, terminated, truncated, info)
 
     def _step(self, command: Array) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        """A control step after which worlds that end stay as they are.
-
-        Whoever steps the environment itself finds it unchanged.
-        """
+        """Take a control step without autoreset; the mode of the environment does not change."""
         env: Any = self.env.unwrapped
         mode = env.autoreset_mode
         env.autoreset_mode = AutoresetMode.DISABLED

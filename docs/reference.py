@@ -20,7 +20,7 @@ import gymnasium
 from pydantic.fields import FieldInfo
 
 import baselines
-from baselines.catalogue import PolicyOptions
+from baselines.policy_options import PolicyOptions
 from baselines.residual.settings import ResidualSettings
 from elastic_env import IDS
 from elastic_env.core.config import Model

@@ -50,9 +50,10 @@ class BrokenFormula:
 
 _ELASTICITY = "elastic_env/joint/elasticity.py"
 _COMPENSATORS = "baselines/compensation/compensators.py"
+_DYNAMIC = "baselines/compensation/dynamic_compensator.py"
 _CONTACT = "baselines/compensation/contact_torque.py"
 _GRAVITY = "baselines/compensation/gravity_torque.py"
-_CONTROLLER = "baselines/walking/controller.py"
+_CONTROLLER = "baselines/walking/control_kernel.py"
 _SHARE = "shifted = share - 4.0 * share * (1.0 - share) * shift / spacing"
 _PREVIEW = "elastic_env/motion/preview_control.py"
 _PLAN = "elastic_env/motion/walk_plan.py"
@@ -100,15 +101,15 @@ BROKEN = (
         "return theta + _solve(gravity, theta",
         COMPENSATION,
     ),
-    BrokenFormula(_COMPENSATORS, "- 0.5 * period_s * theta_dot", "", COMPENSATION),
+    BrokenFormula(_DYNAMIC, "- 0.5 * period_s * theta_dot", "", COMPENSATION),
     BrokenFormula(
-        _COMPENSATORS,
+        _DYNAMIC,
         "drive.rotor_inertia * theta_ddot + torque[world, i]",
         "torque[world, i]",
         COMPENSATION,
     ),
     BrokenFormula(
-        _COMPENSATORS,
+        _DYNAMIC,
         "target + math.exp(-period_s / lag_s)",
         "target + (1.0 - period_s / lag_s)",
         COMPENSATION,
@@ -153,23 +154,25 @@ BROKEN = (
         COMPENSATION,
     ),
     BrokenFormula(_CONTACT, _SHARE, _SHARE.replace("4.0", "1.0"), f"{COMPENSATION} {WALKING}"),
-    BrokenFormula(_CONTROLLER, "(1.0 - 2.0 * share) * own.weight", "share * own.weight", WALKING),
+    BrokenFormula(
+        _CONTROLLER, "(1.0 - 2.0 * share) * memory.weight", "share * memory.weight", WALKING
+    ),
     BrokenFormula(
         _CONTROLLER,
-        "own.velocity[i] / controller.omega",
-        "own.velocity[i] * controller.omega",
+        "memory.velocity[i] / constants.omega",
+        "memory.velocity[i] * constants.omega",
         WALKING,
     ),
     BrokenFormula(
         _CONTROLLER,
-        "roll = -carried * aside",
-        "roll = carried * aside",
+        "roll = -load * left",
+        "roll = load * left",
         WALKING,
     ),
     BrokenFormula(
         _CONTROLLER,
-        "share = shown.load_share if leg == 1 else 1.0 - shown.load_share",
-        "share = shown.load_share if leg == 0 else 1.0 - shown.load_share",
+        "share = obs.load_share if leg == 1 else 1.0 - obs.load_share",
+        "share = obs.load_share if leg == 0 else 1.0 - obs.load_share",
         WALKING,
     ),
     BrokenFormula(

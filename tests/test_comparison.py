@@ -20,7 +20,7 @@ from rich.console import Console
 
 import train.commands.compare
 from baselines.catalogue import BEST_ON_THE_WALKER
-from baselines.residual.residual_policy import read_description
+from baselines.residual.residual_folder import read_description
 from elastic_env.core.config import load_yaml
 from elastic_env.core.errors import ConfigurationError, MissingExtraError
 from tests.cells import METRIC, cell, describe, episode_rows, family, records

@@ -10,8 +10,6 @@ import pytest
 
 import baselines
 from baselines.compensation.compensators import (
-    DriveMemory,
-    DynamicCompensator,
     GravityCompensator,
     Motion,
     input_offset,
@@ -19,6 +17,7 @@ from baselines.compensation.compensators import (
     taylor_link_angle,
 )
 from baselines.compensation.dry_friction import FrictionMemory
+from baselines.compensation.dynamic_compensator import DriveMemory, DynamicCompensator
 from baselines.compensation.gravity_torque import RigidBody, make_gravity
 from elastic_env.core.errors import ConfigurationError, ElasticError
 from elastic_env.core.signals import Array

@@ -13,14 +13,11 @@ from scipy.spatial.transform import Rotation
 
 import baselines
 import elastic_env  # noqa: F401  registers the environments
-from baselines.compensation.compensators import (
-    DynamicCompensator,
-    GravityCompensator,
-    taylor_link_angle,
-)
+from baselines.compensation.compensators import GravityCompensator, taylor_link_angle
 from baselines.compensation.contact_torque import PlannedTorque, WrenchTorque, gravity_in_pelvis
+from baselines.compensation.dynamic_compensator import DynamicCompensator
 from baselines.compensation.gravity_torque import GravityModel, make_gravity
-from baselines.compensation.policy import Motion
+from baselines.compensation.observation_view import Motion
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
 from elastic_env.joint.joint_names import JointAddresses

@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 import baselines
 import elastic_env  # noqa: F401  registers the environments
 from baselines.compensation.contact_torque import ContactGravity, planned_feet, shift_plan
-from baselines.compensation.policy import WalkView
+from baselines.compensation.observation_view import WalkView
 from baselines.walking.controller import WalkingController
-from baselines.walking.mean_zmp import FlatFeet
+from baselines.walking.flat_feet import FlatFeet
 from baselines.walking.zmp_shift import Stances, move_pelvis
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array

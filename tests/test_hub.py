@@ -19,7 +19,7 @@ import gymnasium
 import pytest
 
 import baselines
-from baselines.residual.residual_policy import DESCRIPTION, WEIGHTS, find_folder
+from baselines.residual.residual_folder import DESCRIPTION, WEIGHTS, find_folder
 from elastic_env.core.errors import (
     ConfigurationError,
     ElasticError,

@@ -13,12 +13,10 @@ from safetensors.numpy import save
 
 import baselines
 import elastic_env  # noqa: F401  registers the environments
-from baselines.adaptation.iterative import (
+from baselines.adaptation.iterative import IterativeLearner, Trial
+from baselines.adaptation.learned_signals import LearningGains, WalkSignals
+from baselines.adaptation.learning_law import (
     ChannelGains,
-    IterativeLearner,
-    LearningGains,
-    Trial,
-    WalkSignals,
     lead_error,
     limit_surprise,
     update,
@@ -377,7 +375,7 @@ def test_damaged_files_say_what_is_wrong(run: Path, tmp_path: Path) -> None:
     assert "cannot be read" in problem(offsets=(run / OFFSETS).read_bytes()[:-8])
     assert "must be a baseline" in problem(lambda content: content.update(base="residual:x"))
     assert "describes no table" in problem(lambda content: content.update(colour="red"))
-    with pytest.raises(ConfigurationError, match="nothing learned lies at"):
+    with pytest.raises(ConfigurationError, match="no learned offsets at"):
         baselines.make(f"iterative:{tmp_path / 'nowhere'}", env)
 
 

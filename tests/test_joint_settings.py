@@ -113,7 +113,7 @@ def test_held_joints_are_left_out_of_the_commands(tmp_path: Path) -> None:
     np.testing.assert_allclose(made.torque([0.5, 0.5]), [shoulder, elbow], rtol=1e-9)
     assert list(configure_robot(ARM, tmp_path / "joints.yaml").joints) == TWO
     with pytest.raises(
-        ConfigurationError, match="'gl' is named by `joints`, and stiffness says that it is held"
+        ConfigurationError, match="'gl' is named by `joints`, but held in stiffness"
     ):
         PositionCompensator.from_model(
             mujoco.MjModel.from_xml_string(ARM), {"g*": "held", "j*": 4}, joints=["j1", "gl"]
@@ -128,7 +128,7 @@ def test_what_a_file_leaves_out_is_rigid_and_said(tmp_path: Path) -> None:
     file = written(tmp_path, "j2: {stiffness: 400}\n")
     with pytest.warns(
         UserWarning,
-        match="leaves out j1, gl, taken for rigid; say j1: rigid, j1: held or its stiff",
+        match="leaves out j1, gl, taken for rigid; write j1: rigid, j1: held or its stiff",
     ):
         made = compensator(file)
     q = np.array([0.5, 0.5, 0.0])
@@ -196,7 +196,7 @@ def test_what_the_compensator_cannot_use_it_refuses_by_name() -> None:
         ConfigurationError, match=r"backlash of joint 'j1' is 0.002 rad.*0.001 rad remain"
     ):
         compensator({"*": {"stiffness": 400, "backlash": 2e-3}})
-    with pytest.raises(ConfigurationError, match="servo of joint 'j1' is said twice"):
+    with pytest.raises(ConfigurationError, match="servo of joint 'j1' is given twice"):
         compensator({"*": {"stiffness": 400, "servo": {"position_gain": 800}}}, position_gain=600.0)
     full = {
         "stiffness": 400,

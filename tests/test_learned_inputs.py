@@ -8,13 +8,13 @@ import pytest
 from gymnasium.vector import AutoresetMode
 
 import baselines
-from baselines.compensation.policy import select_rows
+from baselines.compensation.memory import select_rows
 from baselines.residual.correction import Corrected
 from baselines.residual.features import Features
 from baselines.residual.residual_policy import ResidualPolicy
 from baselines.residual.settings import ResidualSettings
 from baselines.residual_env import ResidualVectorWrapper, ResidualWrapper
-from baselines.walking.mean_zmp import LEAST_LOAD, FlatFeet
+from baselines.walking.flat_feet import LEAST_LOAD, FlatFeet
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
 from tests.test_residual import random_network
@@ -209,9 +209,9 @@ def test_inputs_of_many_worlds_are_those_of_each_alone_and_of_the_exported_polic
     ]
     starts = [one.reset(seed=5 + i)[0] for i, one in enumerate(alone)]
     np.testing.assert_array_equal(shown, starts)
-    network = random_network(many._deciding.corrected, 0.5)
+    network = random_network(many._loop.corrected, 0.5)
     env = walkers(2)
-    played = ResidualPolicy(many._deciding.corrected, network)
+    played = ResidualPolicy(many._loop.corrected, network)
     observation, _ = env.reset(seed=5)
     state = None
     for _ in range(50):

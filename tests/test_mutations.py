@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from safetensors.numpy import load_file, save_file
 
-from baselines.residual.residual_policy import load_residual, read_description
+from baselines.residual.residual_folder import load_residual, read_description
 from elastic_env.core.config import load_yaml
 from elastic_env.core.errors import ConfigurationError, quote
 from elastic_env.core.json_text import parse_json

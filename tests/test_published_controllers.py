@@ -10,15 +10,12 @@ import pytest
 import baselines
 import elastic_env  # noqa: F401  registers the environments
 from baselines.policies import Track, sensors_needed, track
-from baselines.walking.published import (
+from baselines.walking.talos import HipTorque, HipTorqueGains, limit_rate, low_pass
+from baselines.walking.thormang import (
     FootBalance,
     FootBalanceGains,
-    HipTorque,
-    HipTorqueGains,
     StanceRoll,
     StanceRollGains,
-    limit_rate,
-    low_pass,
     stance_roll,
 )
 from elastic_env.core.errors import ConfigurationError
@@ -114,7 +111,7 @@ def moved(policy: Any, env: Any, **columns: float) -> tuple[Array, Array]:
     for name in table.names:
         if name.startswith(("imu_", "wrench.")):
             row[:, table.names.index(name)] = 0.0
-    row[:, table.columns("wrench.l_fz", "wrench.r_fz")] = policy._wanted[0, :, 2]
+    row[:, table.columns("wrench.l_fz", "wrench.r_fz")] = policy._wanted_force[0, :, 2]
     for name, value in columns.items():
         row[:, table.names.index(name.replace("__", "."))] += value
     action, _ = policy.predict(row, None, np.array([True]))
@@ -163,13 +160,13 @@ def test_forces_wanted_are_those_of_the_plan() -> None:
     """Catches a share of the wrong foot and a missing acceleration: in sum they are m (g + a)."""
     policy, env = balance()
     model = env.unwrapped.assumed_model
-    total = policy._wanted.sum(axis=1)
+    total = policy._wanted_force.sum(axis=1)
     mass = model.biped.weight / model.biped.gravity
     np.testing.assert_allclose(total[:, 2], model.biped.weight)
     pendulum = model.plan.omega**2 * (model.plan.com - model.plan.zmp)
     np.testing.assert_allclose(total[5:-5, 1] / mass, pendulum[5:-5, 1], atol=0.15)
     single = model.plan.share == 1.0
-    np.testing.assert_array_equal(policy._wanted[single, 0], 0.0)
+    np.testing.assert_array_equal(policy._wanted_force[single, 0], 0.0)
 
 
 def test_a_foot_out_of_reach_comes_as_near_as_the_leg_allows() -> None:

@@ -27,14 +27,14 @@ from baselines.compensation.inputs import input_signals
 from baselines.estimation.bending import BendingObserver
 from baselines.residual.correction import Channels, Corrected
 from baselines.residual.features import Features
-from baselines.residual.residual_policy import (
-    Network,
-    ResidualPolicy,
+from baselines.residual.network import Network
+from baselines.residual.residual_folder import (
     load_residual,
     read_description,
     save_residual,
     shipped_names,
 )
+from baselines.residual.residual_policy import ResidualPolicy
 from baselines.residual.settings import ResidualDescription, ResidualSettings
 from baselines.residual_env import ResidualVectorWrapper, ResidualWrapper
 from elastic_env.core.errors import ActionError, ConfigurationError

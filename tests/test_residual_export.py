@@ -15,7 +15,7 @@ import pytest
 import baselines
 from baselines.residual.correction import Corrected
 from baselines.residual.features import Features
-from baselines.residual.residual_policy import save_residual
+from baselines.residual.residual_folder import save_residual
 from baselines.residual.settings import ResidualDescription, ResidualSettings
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from baselines.walking.mean_zmp import StandingEstimate, StandingGains
+from baselines.walking.standing_estimate import StandingEstimate, StandingGains
 from elastic_env.motion.trajectory import STAND_S
 from tests.test_zmp_offset import OFFSET_M, Recorder, standing, vector
 

@@ -12,7 +12,7 @@ from gymnasium.vector import AutoresetMode
 import baselines
 from baselines.residual.correction import Corrected
 from baselines.residual.features import Features
-from baselines.residual.residual_policy import load_residual, save_residual
+from baselines.residual.residual_folder import load_residual, save_residual
 from baselines.residual.settings import (
     TRUE_QUANTITIES,
     ResidualDescription,

@@ -10,8 +10,9 @@ import pytest
 import baselines
 import elastic_env  # noqa: F401  registers the environments
 from baselines.adaptation.disturbance_observer import DisturbanceObserver, ObserverGains
-from baselines.compensation.compensators import DynamicCompensator, Motion
+from baselines.compensation.compensators import Motion
 from baselines.compensation.dry_friction import PRESLIDING_RAD, presliding_friction
+from baselines.compensation.dynamic_compensator import DynamicCompensator
 from baselines.policies import Track, sensors_needed, track
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array

@@ -24,7 +24,7 @@ from rich.console import Console
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import baselines
-from baselines.residual.residual_policy import load_residual
+from baselines.residual.residual_folder import load_residual
 from baselines.residual_env import ResidualVectorWrapper
 from elastic_env.core.errors import ConfigurationError, ElasticError
 from elastic_env.core.signals import Array

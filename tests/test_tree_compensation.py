@@ -154,5 +154,5 @@ def test_a_robot_of_servos_that_give_way_starts_at_rest() -> None:
 
 def test_a_method_that_knows_gravity_alone_is_refused() -> None:
     """Catches springs and gravcomp that are silently left out."""
-    with pytest.raises(ConfigurationError, match=r"'hinge' knows gravity alone.*choose tree"):
+    with pytest.raises(ConfigurationError, match=r"'hinge' has gravity only.*choose tree"):
         make_gravity(RobotModel(joints(0.0), rigid().compile(), 0.004), "hinge")

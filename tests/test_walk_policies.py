@@ -12,13 +12,14 @@ import pytest
 import baselines
 import elastic_env  # noqa: F401  registers the environments
 from baselines.catalogue import ON_JOINTS, ON_THE_WALKER, QUICK_WALKING
-from baselines.compensation.compensators import DynamicCompensator, GravityCompensator
+from baselines.compensation.compensators import GravityCompensator
+from baselines.compensation.dynamic_compensator import DynamicCompensator
 from baselines.compensation.gravity_torque import make_gravity
 from baselines.compensation.oracle import Oracle, TrueSensors
 from baselines.compensation.policy import Zero
 from baselines.policies import sensors_needed
 from baselines.walking.controller import WalkingController, WalkingGains
-from baselines.walking.foothold import RefinedWalk, refine_model
+from baselines.walking.refined_walk import RefinedWalk, refine_model
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
 

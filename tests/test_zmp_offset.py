@@ -9,7 +9,7 @@ import pytest
 import baselines
 import elastic_env  # noqa: F401  registers the environments
 from baselines.compensation.policy import PolicyInputs, Zero
-from baselines.walking.mean_zmp import ZmpOffset, ZmpOffsetGains
+from baselines.walking.zmp_offset import ZmpOffset, ZmpOffsetGains
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
 from elastic_env.world.foot_sensors import FootSensors

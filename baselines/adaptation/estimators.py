@@ -1,4 +1,4 @@
-r"""By how much the joints bend more than the model says, r, from what a robot measures.
+r"""Estimates of r, by how much the joints bend more than the model predicts, from measurements.
 
 | estimator | measures | 1 + r |
 |---|---|---|
@@ -8,21 +8,21 @@ r"""By how much the joints bend more than the model says, r, from what a robot m
 | `EncoderEstimator` | encoders on motors and links of a robot on a fixed base | 1 + r_j joint by joint |
 
 ρ is the relative error of a leg's compliance by `BendingObserver`, μ the mean excess load of the
-feet. Without torque sensors ρ of pitch is left out: friction hides the bending there. Joints
-without a link encoder have r_j = 0. r_j is by the regression below. The expected deflection is
-:math:`h = K^{-1} (\tau + \tau_F)` with the Coulomb friction, and with the torque of the measured foot wrenches, or of the
-motion on a fixed base.
+feet. Without torque sensors ρ of pitch is not used: friction hides the bending there. Joints
+without a link encoder have r_j = 0. The regression below estimates r_j. The expected deflection is
+:math:`h = K^{-1} (\tau + \tau_F)` with the Coulomb friction, and with the torque of the measured
+foot wrenches, or of the motion on a fixed base.
 
-**Regression.** The Coulomb friction :math:`\tau_F` turns round over a short displacement of the
-link [Dahl1968]. Sensors show
+**Regression.** The Coulomb friction :math:`\tau_F` changes its sign over a short displacement of
+the link [Dahl1968]. Sensors measure
 
 .. math:: \delta = (1 + r) h + c
 
 with c for homing errors. This is linear regression of δ − h on h, joint by joint, after every
-measurement. Its prior says that the joints of a robot are alike: :math:`r \sim N(0, \sigma_c^2
-\mathbf{1}\mathbf{1}^T + \sigma_i^2 I)`, so that joints without load take after the others
-[Gelman2013, chapter 15]. The normal matrix is diagonal but for one rank, which the matrix inversion
-lemma solves in closed form.
+measurement. By its prior the joints of a robot are alike: :math:`r \sim N(0, \sigma_c^2
+\mathbf{1}\mathbf{1}^T + \sigma_i^2 I)`, so that the estimate of joints without load follows the
+others [Gelman2013, chapter 15]. The normal matrix is diagonal plus a matrix of rank one. The matrix
+inversion lemma gives its solution in closed form.
 
 [Dahl1968] P. R. Dahl, "A Solid Friction Model", The Aerospace Corporation, TOR-0158(3107-18)-1.
 [Gelman2013] A. Gelman et al., "Bayesian Data Analysis", 3rd edition.
@@ -38,7 +38,7 @@ from baselines.compensation.compensators import GravityCompensator
 from baselines.compensation.dry_friction import presliding_friction
 from baselines.compensation.gravity_torque import make_gravity
 from baselines.compensation.measured import DeflectionSensors
-from baselines.compensation.policy import ObservationView
+from baselines.compensation.observation_view import ObservationView
 from baselines.estimation.bending import BendingObserver
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array, SignalTable
@@ -51,7 +51,7 @@ class StiffnessPrior(Model):
     common: float = quantity("1", 0.5, gt=0)
     """Relative error that all joints share [1]."""
     own: float = quantity("1", 0.1, gt=0)
-    """Relative error of a joint beside it [1]."""
+    """Relative error of a single joint in addition [1]."""
     offset_rad: float = quantity("rad", 0.002, gt=0)
     """Offset of a measured deflection [rad]."""
     noise_rad: float = quantity("rad", 0.01, gt=0)
@@ -70,27 +70,27 @@ def regress(sums: Array, prior: StiffnessPrior) -> Array:
         (..., n) [1].
     """
     number, h, hh, y, hy = sums
-    counted = number + (prior.noise_rad / prior.offset_rad) ** 2  # c is eliminated
-    information = (hh - h * h / counted) / prior.noise_rad**2
-    right = (hy - h * y / counted) / prior.noise_rad**2
+    weight = number + (prior.noise_rad / prior.offset_rad) ** 2  # c is eliminated
+    information = (hh - h * h / weight) / prior.noise_rad**2
+    right_side = (hy - h * y / weight) / prior.noise_rad**2
     own = prior.own**2
     common = prior.common**2
     n = h.shape[-1]
     diagonal = 1.0 / own + information
     rank_one = common / (own * (own + n * common))
-    alone = right / diagonal
-    shared = rank_one / diagonal
-    common = alone.sum(axis=-1) / (1.0 - shared.sum(axis=-1))
-    return alone + shared * common[..., None]
+    diagonal_solution = right_side / diagonal
+    ratio = rank_one / diagonal
+    total = diagonal_solution.sum(axis=-1) / (1.0 - ratio.sum(axis=-1))
+    return diagonal_solution + ratio * total[..., None]
 
 
-_SEEN = SignalTable(BendingObserver.signals)
-_ERROR = _SEEN.group("model_error")
-_LOAD = _SEEN.names.index("excess_load")
+_BENDING = SignalTable(BendingObserver.signals)
+_ERROR = _BENDING.group("model_error")
+_LOAD = _BENDING.names.index("excess_load")
 _AXIS = np.array([0, 0, 1, 1, 1, 0])  # roll or pitch, of the joints of a leg
-_BENDS = np.array([0.0, 1.0, 1.0, 1.0, 1.0, 1.0])  # the yaw hardly does
+_CORRECTED = np.array([0.0, 1.0, 1.0, 1.0, 1.0, 1.0])  # the yaw hardly bends
 ASSUMED_LOADS = 5.0
-"""Number of measurements that the assumed load counts for."""
+"""Number of measurements that have the weight of the assumed load."""
 
 
 class Estimator(Protocol):
@@ -102,11 +102,11 @@ class Estimator(Protocol):
 
     @abstractmethod
     def estimate(self, rows: Array, memory: Any) -> tuple[Array, Any]:
-        """The correction r of every joint, (num_worlds, n) [1], and the new memory."""
+        """Correction r of every joint, (num_worlds, n) [1], and the new memory."""
 
-    def load(self, memory: Any) -> Array | None:  # noqa: ARG002
-        """The mean excess load μ that r has a part for, (num_worlds, 1) [1]; None for none."""
-        return None
+    def load(self, memory: Any) -> Array | None:
+        """Mean excess load μ within r, (num_worlds, 1) [1]; None for none."""
+        return _mean(memory.loads) if isinstance(memory, EstimatorMemory) else None
 
 
 class EstimatorMemory(NamedTuple):
@@ -119,43 +119,36 @@ class EstimatorMemory(NamedTuple):
 class LegEstimator(Estimator):
     """r of each leg by motors, foot sensors and IMU, and by joint torques where there are any.
 
-    Attributes `observer` and `sensors` are what it estimates with.
+    Attributes:
+        observer: Estimates the relative error of each leg.
+        sensors: Joint torque sensors; None without.
 
     Args:
         model: Assumed walker.
         sensors: Joint torque sensors, if it has them.
     """
 
-    def __init__(
-        self,
-        model: WalkerModel,
-        sensors: DeflectionSensors | None = None,
-    ) -> None:
+    def __init__(self, model: WalkerModel, sensors: DeflectionSensors | None = None) -> None:
         self.observer = BendingObserver(model)
         self.sensors = sensors
         self._axis = np.zeros_like(_AXIS) if sensors is None else _AXIS
 
     @override
     def begin(self, num_worlds: int) -> EstimatorMemory:
-        loads = np.zeros((num_worlds, 2))
-        return EstimatorMemory(loads, self.observer.begin(num_worlds))
-
-    @override
-    def load(self, memory: EstimatorMemory) -> Array:
-        return _mean(memory.loads)
+        return EstimatorMemory(np.zeros((num_worlds, 2)), self.observer.begin(num_worlds))
 
     def observe(self, rows: Array, memory: EstimatorMemory) -> tuple[Array, Array, Any]:
         """Values of the observer, the mean excess load, (num_worlds, 1) [1], and new memory."""
         bending = None if self.sensors is None else self.sensors.deflection(rows)
-        seen, observer = self.observer.observe(rows, memory.observer, bending)
-        load, loads = mean_load(memory.loads, seen[:, [_LOAD]])
-        return seen, load, EstimatorMemory(loads, observer)
+        values, observer = self.observer.observe(rows, memory.observer, bending)
+        load, loads = mean_load(memory.loads, values[:, [_LOAD]])
+        return values, load, EstimatorMemory(loads, observer)
 
     @override
     def estimate(self, rows: Array, memory: EstimatorMemory) -> tuple[Array, Any]:
-        seen, load, memory = self.observe(rows, memory)
-        error = seen[:, _ERROR].reshape(len(rows), 2, 2)[:, :, self._axis]
-        joints = ((1.0 + error) * (1.0 + load[:, :, None]) - 1.0) * _BENDS
+        values, load, memory = self.observe(rows, memory)
+        error = values[:, _ERROR].reshape(len(rows), 2, 2)[:, :, self._axis]
+        joints = ((1.0 + error) * (1.0 + load[:, :, None]) - 1.0) * _CORRECTED
         return joints.reshape(len(rows), -1), memory
 
 
@@ -163,9 +156,9 @@ class RegressionMemory(NamedTuple):
     """Memory of a regression.
 
     Attributes:
-        friction: That holds the links back, (num_worlds, n) [N·m].
+        friction: Friction that holds the links back, (num_worlds, n) [N·m].
         q: Link angles of the last measurement, (num_worlds, n) [rad].
-        sums: As of `regress`, (num_worlds, 5, n).
+        sums: Argument of `regress`, (num_worlds, 5, n).
     """
 
     friction: Array
@@ -182,19 +175,17 @@ class EncoderEstimator(Estimator):
     """
 
     prior = StiffnessPrior(own=0.3, noise_rad=0.005)
-    """Joints of an arm are less alike than those of two legs, and no foot sensors add errors of
-    their own.
-    """
+    """Joints of an arm are less alike than joints of two legs, and foot sensors add no errors."""
 
     def __init__(self, model: RobotModel, sensors: DeflectionSensors) -> None:
         self._model = model
         model.require_constant_friction("the estimate of the stiffness")
         self._sensors = sensors
         self._view = ObservationView(model)
-        self._compensator = self._compensator_of(model)
+        self._torque_model = self._make_torque_model(model)
 
-    def _compensator_of(self, model: RobotModel) -> Any:
-        """Says which deflection to expect."""
+    def _make_torque_model(self, model: RobotModel) -> Any:
+        """Make the model of the expected deflection."""
         return make_gravity(model)
 
     @override
@@ -206,31 +197,29 @@ class EncoderEstimator(Estimator):
     def estimate(self, rows: Array, memory: Any) -> tuple[Array, Any]:
         deflection = self._sensors.deflection(rows)
         q = self._view.theta(rows) - deflection
-        moved = np.where(memory.sums[:, 0] > 0.0, q - memory.q, 0.0)
-        coulomb = self._model.coulomb_friction
-        friction = presliding_friction(memory.friction, moved, coulomb)
-        h = self._expected(rows, q, friction)
+        displacement = np.where(memory.sums[:, 0] > 0.0, q - memory.q, 0.0)
+        friction = presliding_friction(memory.friction, displacement, self._model.coulomb_friction)
+        h = self._expected_deflection(rows, q, friction)
         y = deflection - h
-        own = np.stack([np.ones_like(h), h, h * h, y, h * y], axis=1)
-        sums = memory.sums + self._sensors.has * own
-        error = regress(sums.swapaxes(0, 1), self.prior)
-        return error, RegressionMemory(friction, q, sums)
+        terms = np.stack([np.ones_like(h), h, h * h, y, h * y], axis=1)
+        sums = memory.sums + self._sensors.has * terms
+        return regress(sums.swapaxes(0, 1), self.prior), RegressionMemory(friction, q, sums)
 
-    def _expected(self, rows: Array, q: Array, friction: Array) -> Array:
+    def _expected_deflection(self, rows: Array, q: Array, friction: Array) -> Array:
         """Deflection h under the torque of the motion and under friction, (num_worlds, n) [rad]."""
         motion = self._view.motion(rows)
-        torque = self._compensator.inverse_dynamics(q, motion.q_dot, motion.q_ddot)
+        torque = self._torque_model.inverse_dynamics(q, motion.q_dot, motion.q_ddot)
         torque = torque + self._model.viscous_friction * motion.q_dot
         return (torque + friction) / self._model.stiffness
 
 
 class LegEncoderEstimator(EncoderEstimator):
-    """r of a walker's joints; those without a link encoder take part in the load alone."""
+    """r of a walker's joints; for joints without a link encoder by the load only."""
 
     prior = StiffnessPrior()
 
     @override
-    def _compensator_of(self, model: Any) -> Any:
+    def _make_torque_model(self, model: Any) -> Any:
         self._wrench = model.observation_table.group("wrench")
         self._carried = model.biped.chains_above_feet.mass * model.biped.gravity
         return GravityCompensator(model, output="wrench")
@@ -249,18 +238,14 @@ class LegEncoderEstimator(EncoderEstimator):
         return r, EstimatorMemory(loads, observer)
 
     @override
-    def load(self, memory: EstimatorMemory) -> Array:
-        return _mean(memory.loads)
-
-    @override
-    def _expected(self, rows: Array, q: Array, friction: Array) -> Array:
+    def _expected_deflection(self, rows: Array, q: Array, friction: Array) -> Array:
         theta = self._view.theta(rows)
-        modelled = theta - self._compensator.at(rows).link_angle(theta)
+        modelled = theta - self._torque_model.at(rows).link_angle(theta)
         return modelled + friction / self._model.stiffness
 
 
 def make_estimator(model: RobotModel, sensors: DeflectionSensors) -> Estimator:
-    """The estimator that makes the most of a robot's sensors."""
+    """Make the estimator for a robot's sensors."""
     if not isinstance(model, WalkerModel):
         return EncoderEstimator(model, sensors)
     if sensors.are_torques:

@@ -1,8 +1,8 @@
 """Learned offsets of `iterative` as a folder: `iterative.json` and `offsets.safetensors`.
 
 The table has a row for every control step of the motion and a column for every learned signal, in
-SI units. Loading it runs no code from it. It plays in an environment of the same robot, motion and
-control period alone.
+SI units. Loading runs no code from the folder. The table plays in environments of the same robot,
+motion and control period only.
 """
 
 from pathlib import Path
@@ -12,7 +12,7 @@ import numpy as np
 from pydantic import AfterValidator, Field
 from safetensors.numpy import save
 
-from baselines.adaptation.iterative import LearningGains
+from baselines.adaptation.learned_signals import LearningGains
 from elastic_env.core.config import MOST_ENTRIES, Model, Title, load_json, quantity
 from elastic_env.core.errors import ConfigurationError, quote
 from elastic_env.core.files import write_whole
@@ -22,7 +22,8 @@ from elastic_env.core.tensors import read_tensors
 DESCRIPTION = "iterative.json"
 OFFSETS = "offsets.safetensors"
 _TENSOR = "offsets"
-_LARGEST = 1.0
+_LARGEST_OFFSET = 1.0
+"""Bound on an offset [rad] or [m]."""
 
 
 def _require_base(name: str) -> str:
@@ -32,7 +33,7 @@ def _require_base(name: str) -> str:
 
 
 class TableDescription(Model):
-    """Content of `iterative.json`, about the table beside it."""
+    """Content of `iterative.json`, which describes the table in the same folder."""
 
     robot: Title
     """Task of the environment, walker or testbed."""
@@ -42,11 +43,11 @@ class TableDescription(Model):
     signals: list[Title] = Field(min_length=1, max_length=MOST_ENTRIES)
     """Learned signals with their unit, one per column."""
     motion: dict[str, Any]
-    """Gait or reference, which has to be that of the environment."""
+    """Gait or reference; the environment must have the same."""
     control_period_s: float = quantity("s", gt=0)
     """Time between rows [s]."""
     scenario: Title
-    """That it was learned in."""
+    """Scenario in which it was learned."""
     training: dict[str, Any] = {}
     """Seed of the robot, commit, versions."""
 
@@ -54,15 +55,14 @@ class TableDescription(Model):
 def motion_of(env: Any) -> dict[str, Any]:
     """Gait or reference of an environment."""
     config = env.unwrapped.task.config
-    motion = config.gait if hasattr(config, "gait") else config.reference
-    return motion.model_dump(mode="json")
+    return (config.gait if hasattr(config, "gait") else config.reference).model_dump(mode="json")
 
 
 def save_table(folder: Path, description: TableDescription, table: Array) -> None:
     """Write a table, (T, k), that `load_table` reads.
 
     Raises:
-        ConfigurationError: A table that is none.
+        ConfigurationError: The table is not valid.
     """
     _require_table(description, table)
     folder.mkdir(parents=True, exist_ok=True)
@@ -71,7 +71,7 @@ def save_table(folder: Path, description: TableDescription, table: Array) -> Non
 
 
 def read_table_description(folder: Path) -> TableDescription:
-    """Description of a table.
+    """Read the description of a table.
 
     Raises:
         ConfigurationError: There is none, or it is not valid.
@@ -79,13 +79,13 @@ def read_table_description(folder: Path) -> TableDescription:
 
     def missing(why: str) -> str:
         needed = f"a folder with {DESCRIPTION} and {OFFSETS} is needed ({why})"
-        return f"nothing learned lies at {folder}: {needed}, as `elastic iterate` writes it"
+        return f"no learned offsets at {folder}: {needed}, as `elastic iterate` writes it"
 
     return load_json(folder / DESCRIPTION, TableDescription, "table", missing, folder)
 
 
 def load_table(folder: Path, env: Any) -> tuple[TableDescription, Array]:
-    """A table for an environment, (T, k).
+    """Read a table for an environment, (T, k).
 
     Raises:
         ConfigurationError: There is none, it is damaged, or it was learned for something else.
@@ -111,8 +111,8 @@ def _require_table(description: TableDescription, table: Array) -> None:
         raise ConfigurationError(
             f"the table must have the shape (T, {k}) with T >= 2, got {table.shape}"
         )
-    if not np.isfinite(table).all() or np.abs(table).max() > _LARGEST:
-        raise ConfigurationError(f"offsets must be finite within ±{_LARGEST:g} rad or m")
+    if not np.isfinite(table).all() or np.abs(table).max() > _LARGEST_OFFSET:
+        raise ConfigurationError(f"offsets must be finite within ±{_LARGEST_OFFSET:g} rad or m")
 
 
 def _require_same(folder: Path, learned: Any, table: Array, env: Any) -> None:
@@ -121,17 +121,17 @@ def _require_same(folder: Path, learned: Any, table: Array, env: Any) -> None:
     period_s = task.assumed_model.control_period_s
     # another robot may have another kind of motion
     motion = motion_of(env) if learned.robot == task.name else {}
-    pairs = [
+    properties = [
         ("the robot", learned.robot, task.name),
         ("the control period", learned.control_period_s, period_s),
         ("the number of rows", len(table), task.num_steps + 1),
     ]
     for key in {**motion, **learned.motion}:
-        what = f"a motion whose {key} is"
-        pairs.append((what, learned.motion.get(key), motion.get(key)))
-    for what, known, given in pairs:
-        if known != given:
+        name = f"a motion whose {key} is"
+        properties.append((name, learned.motion.get(key), motion.get(key)))
+    for name, in_folder, in_env in properties:
+        if in_folder != in_env:
             raise ConfigurationError(
-                f"{folder} was learned with {what} {quote(known)}, the environment has"
-                f" {quote(given)}; learn it anew: offsets of one motion are wrong in another"
+                f"{folder} was learned with {name} {quote(in_folder)}, the environment has"
+                f" {quote(in_env)}; learn it again: offsets of one motion are wrong in another"
             )

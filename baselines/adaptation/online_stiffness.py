@@ -1,10 +1,8 @@
-"""A compensated policy whose model of the joints is corrected while the robot walks.
+"""Adaptive control: a compensated policy whose joint model is corrected while the robot moves.
 
-Adaptive control does the same.
-
-The deflection that is compensated, and seen, is (1 + r) times that of the model. An estimator of
-`baselines.adaptation.estimators` says r every tenth of a second, and a first-order filter smooths
-it: the command must change more slowly than what it is estimated from [Spong1995].
+The compensated deflection is (1 + r) times the deflection of the model. An estimator of
+`baselines.adaptation.estimators` gives r every tenth of a second, and a first-order filter smooths
+it: the command must change more slowly than the measurements behind the estimate [Spong1995].
 
 [Spong1995] M. W. Spong, "Adaptive Control of Flexible Joint Manipulators: Comments on Two Papers",
 Automatica 31(4).
@@ -15,14 +13,15 @@ from typing import Any, NamedTuple
 import numpy as np
 from typing_extensions import override
 
-from baselines.compensation import policy as policies
+from baselines.compensation.memory import put_rows, select_rows
+from baselines.compensation.policy import PolicyAround, PolicyInputs, Step, filter_share
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array, IntArray
 from elastic_env.world.robot_model import RobotModel
 
 
 class AdaptationGains(Model):
-    """How fast the model of the joints is corrected."""
+    """Period, filter and limit of the correction of the joint model."""
 
     period_s: float = quantity("s", 0.1, gt=0)
     """Time between two estimates [s]."""
@@ -50,20 +49,20 @@ class StiffnessMemory(NamedTuple):
     inner: Any
 
 
-class OnlineStiffness(policies.PolicyAround):
-    """A compensated policy whose model of the joints is corrected by what is measured.
+class OnlineStiffness(PolicyAround):
+    """A compensated policy whose joint model is corrected by measurements.
 
     Attributes:
-        estimator: Says r.
+        estimator: Estimates r.
         every: Control steps from an estimate to the next one.
-        share: Of its way to the estimate that the correction goes in a control step [1].
+        share: Share of its way to the estimate that the correction goes in a control step [1].
         limit: Largest correction [1].
 
     Args:
-        policy: The policy that is corrected; it has the input `deflection`.
+        policy: Policy that is corrected; it has the input `deflection`.
         model: Assumed robot.
-        estimator: Says r.
-        gains: How fast.
+        estimator: Estimates r.
+        gains: Period, filter and limit.
     """
 
     def __init__(
@@ -73,7 +72,7 @@ class OnlineStiffness(policies.PolicyAround):
         dt = model.control_period_s
         self.estimator = estimator
         self.every = max(round(gains.period_s / dt), 1)
-        self.share = policies.filter_share(dt, gains.filter_s)
+        self.share = filter_share(dt, gains.filter_s)
         self.limit = gains.limit
 
     @override
@@ -84,23 +83,22 @@ class OnlineStiffness(policies.PolicyAround):
         return StiffnessMemory(wait, zero, zero, estimator, self.policy.begin(rows))
 
     @override
-    def act(self, rows: Array, memory: StiffnessMemory, inputs: Any) -> policies.Step:
-        """The input `deflection` r' comes on top, (1 + r) (1 + r') δ."""
+    def act(self, rows: Array, memory: StiffnessMemory, inputs: PolicyInputs) -> Step:
+        """Act for a control step; an input `deflection` r' multiplies, (1 + r) (1 + r') δ."""
         wait = memory.wait - 1
         target = memory.target
-        own = memory.estimator
+        state = memory.estimator
         if np.count_nonzero(memory.wait) < len(rows):
             due = memory.wait == 0
             wait[due] = self.every - 1
-            before = policies.select_rows(own, due)
-            estimate, after = self.estimator.estimate(rows[due], before)
+            estimate, after = self.estimator.estimate(rows[due], select_rows(state, due))
             estimate = np.clip(estimate, -self.limit, self.limit)
-            target = policies.put_rows(target, due, estimate)
-            own = policies.put_rows(own, due, after)
+            target = put_rows(target, due, estimate)
+            state = put_rows(state, due, after)
         correction = memory.correction + self.share * (target - memory.correction)
-        together = correction
+        deflection = correction
         if inputs.deflection is not None:
-            together = (1.0 + correction) * (1.0 + inputs.deflection) - 1.0
-        inputs = inputs._replace(deflection=together, load=self.estimator.load(own))
+            deflection = (1.0 + correction) * (1.0 + inputs.deflection) - 1.0
+        inputs = inputs._replace(deflection=deflection, load=self.estimator.load(state))
         action, inner = self.policy.act(rows, memory.inner, inputs)
-        return action, StiffnessMemory(wait, target, correction, own, inner)
+        return action, StiffnessMemory(wait, target, correction, state, inner)

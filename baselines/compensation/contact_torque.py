@@ -1,7 +1,7 @@
 r"""Joint torques of a walker on its feet: Eqs. 4 to 6 of the paper, and from foot wrenches.
 
 The paper takes τ_g = J_r^T F_r + J_l^T F_l with Jacobians from the center of mass to the contact
-points. Where the contact point is, and what of the robot has mass, is chosen by name:
+points. A name chooses the contact points, and the links that have mass:
 
 | name | contact | masses |
 |---|---|---|
@@ -17,12 +17,8 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from baselines.compensation.policy import (
-    ObservationView,
-    WalkView,
-    record_row,
-    record_rows,
-)
+from baselines.compensation.observation_view import ObservationView, WalkView
+from baselines.compensation.records import record_row, record_rows
 from elastic_env.core.compiled import compiled, compiled_part
 from elastic_env.core.signals import Array
 from elastic_env.motion.walk_plan import WalkPlan
@@ -34,7 +30,7 @@ ContactMethod = Literal["com", "ankle", "lumped"]
 
 
 def planned_feet(plan: WalkPlan) -> Any:
-    """The feet where a plan has them, one row per control step.
+    """Planned feet, one row per control step.
 
     The local frame is that of `elastic_env.motion.walk_plan`.
     """
@@ -51,7 +47,7 @@ def planned_feet(plan: WalkPlan) -> Any:
 
 
 def cosine_and_sine(angles: Array) -> Array:
-    """Both of angles, (...) [rad] to (..., 2) [1]."""
+    """Cosine and sine of angles, (...) [rad] to (..., 2) [1]."""
     return np.stack([np.cos(angles), np.sin(angles)], axis=-1)
 
 
@@ -64,7 +60,7 @@ class ContactGravity:
 
     Attributes:
         chains: Its legs.
-        contact: How the ground carries the robot, a row, (1,).
+        contact: Weight, contact and period for the kernels, a row, (1,).
 
     Args:
         model: Assumed walker.
@@ -85,16 +81,16 @@ class ContactGravity:
         self._feet = planned_feet(model.plan)
 
     def at(self, rows: Array, level: bool = True) -> LegTorque:
-        """The gravity torque under the load share of observations, (num_worlds, m).
+        """Gravity torque under the load share of observations.
 
         Args:
-            rows: Observations.
-            level: Whether the pelvis is level, as commanded, or tilted as the IMU says.
+            rows: Observations, (num_worlds, m).
+            level: True for a level pelvis, as commanded, False for a tilt as the IMU measures it.
         """
         return self.level_and_tilted(rows)[0 if level else 1]
 
     def level_and_tilted(self, rows: Array) -> tuple[LegTorque, LegTorque]:
-        """The gravity torques of `at` for a level pelvis, and for one tilted as the IMU says."""
+        """Gravity torques of `at` for a level pelvis, and for a tilted one."""
         level = np.empty(len(rows), LOADS)
         tilted = np.empty(len(rows), LOADS)
         planned_loads(self._view.fields(rows), self.contact, self._feet, level, tilted)
@@ -114,10 +110,7 @@ class WrenchTorque:
         self._gravity = model.biped.gravity
 
     def at(self, rows: Array, level: bool = False) -> LegTorque:
-        """The torque under the wrenches of observations, (num_worlds, m).
-
-        `level` is that of `ContactGravity.at`.
-        """
+        """Torque under the wrenches of observations; arguments as `ContactGravity.at`."""
         loads = np.empty(len(rows), LOADS)
         measured_loads(self._view.fields(rows), self._gravity, level, loads)
         return LegTorque(self._chains, loads)
@@ -126,7 +119,7 @@ class WrenchTorque:
 class PlannedTorque:
     """Torque of the planned motion by inverse dynamics, and the static torque of changes of it.
 
-    Changes are offsets of the joints, and a ZMP that is shifted.
+    Changes are offsets of the joints, and a shifted ZMP.
 
     Args:
         model: Assumed walker.
@@ -142,53 +135,52 @@ class PlannedTorque:
         rows[:, table.group("clock").start] = plan.timing.time
         rows[:, table.group("zmp_reference")] = plan.zmp
         rows[:, table.group("load_share")] = plan.share[:, None]
-        self._of_motion = plan.torque - gravity.at(rows).gravity_torque(plan.q)
+        self._dynamic = plan.torque - gravity.at(rows).gravity_torque(plan.q)
 
     def at(self, rows: Array, gravity: LegTorque | None = None) -> "BoundPlannedTorque":
-        """The torque at the control steps of observations, (num_worlds, m).
+        """Torque at the control steps of observations, (num_worlds, m).
 
-        `gravity` is the static one, if known.
+        `gravity` is the static torque, if known.
         """
-        of_motion = self._of_motion.take(self._view.plan_row(rows), axis=0, mode="clip")
-        return BoundPlannedTorque(of_motion, gravity or self._gravity.at(rows))
+        dynamic = self._dynamic.take(self._view.plan_row(rows), axis=0, mode="clip")
+        return BoundPlannedTorque(dynamic, gravity or self._gravity.at(rows))
 
 
 class BoundPlannedTorque(NamedTuple):
-    """Torque of a planned control step; `inverse_dynamics` as that of a `RigidBody`."""
+    """Torque of a planned control step, with the `inverse_dynamics` of a `RigidBody`."""
 
-    of_motion: Array
-    """What the planned motion adds to the static torque, (num_worlds, 12) [N·m]."""
+    dynamic: Array
+    """Torque of the planned motion beyond the static torque, (num_worlds, 12) [N·m]."""
     gravity: LegTorque
 
     def inverse_dynamics(self, q: Array, q_dot: Array, q_ddot: Array) -> Array:  # noqa: ARG002
         """Torque at joint angles near the plan's, (num_worlds, 12) [rad] to [N·m]."""
-        return self.of_motion + self.gravity.gravity_torque(q)
+        return self.dynamic + self.gravity.gravity_torque(q)
 
 
 @compiled
-def planned_loads(observed: Any, contact: Any, feet: Any, level: Any, tilted: Any) -> None:
-    """Loads under the planned load share.
+def planned_loads(observations: Any, contact: Any, feet: Any, level: Any, tilted: Any) -> None:
+    """Fill in loads under the planned load share.
 
     Args:
-        observed: Observations, rows with fields.
-        contact: How the ground carries the robot, a row, (1,).
+        observations: Rows with fields.
+        contact: Attribute of `ContactGravity`, a row, (1,).
         feet: Rows of `planned_feet`.
         level: Loads of a pelvis that is level, to be filled, rows of `LOADS`.
-        tilted: The same of one that is tilted as the IMU says.
+        tilted: Loads of a pelvis that is tilted as the IMU measures it, likewise.
     """
     ground = contact[0]
     for world in range(len(level)):
         load = level[world]
-        plan = observed[world]
-        stance = feet[row_of_plan(plan, ground.period_s, 0.0, len(feet))]
-        fill_gravity(plan, ground.gravity, True, load)
-        share = plan.load_share
-        x = from_middle(plan, stance, share, 0)
-        y = from_middle(plan, stance, share, 1)
+        obs = observations[world]
+        stance = feet[plan_row(obs, ground.period_s, 0.0, len(feet))]
+        fill_gravity(obs, ground.gravity, True, load)
+        share = obs.load_share
+        x = zmp_from_middle(obs, stance, share, 0)
+        y = zmp_from_middle(obs, stance, share, 1)
         for foot in range(2):
-            weight = share if foot == 1 else 1.0 - share
-            # what the ground carries is a negative mass where it does
-            load.mass[foot] = -ground.mass * weight
+            # the ground's force is a negative mass at the contact point
+            load.mass[foot] = -ground.mass * (share if foot == 1 else 1.0 - share)
             load.point[foot] = 0.0
             load.wrench[foot] = 0.0
             if ground.is_at_zmp:
@@ -198,55 +190,54 @@ def planned_loads(observed: Any, contact: Any, feet: Any, level: Any, tilted: An
                 load.point[foot, 1] = cosine * y - sine * x
                 load.point[foot, 2] = -ground.ankle_height
         tilted[world] = load
-        fill_gravity(plan, ground.gravity, False, tilted[world])
+        fill_gravity(obs, ground.gravity, False, tilted[world])
 
 
 @compiled_part
-def from_middle(plan: Any, stance: Any, share: float, axis: int) -> float:
-    """The planned ZMP from the soles' middle weighted by their loads, in the world [m]."""
+def zmp_from_middle(obs: Any, stance: Any, share: float, axis: int) -> float:
+    """Planned ZMP from the soles' middle weighted by their loads, in the world [m]."""
     left = (1.0 - share) * stance.soles[0, axis]
     middle = left + share * stance.soles[1, axis]
-    return plan.zmp_reference[axis] - middle
+    return obs.zmp_reference[axis] - middle
 
 
 @compiled_part
-def row_of_plan(observed: Any, period_s: float, periods_ago: float, rows: int) -> int:
+def plan_row(obs: Any, period_s: float, periods_ago: float, rows: int) -> int:
     """Row of the plan at the end of the coming control period, or some periods before it."""
-    periods = np.rint(observed.clock[0] / period_s)
+    periods = np.rint(obs.clock[0] / period_s)
     return int(min(max(periods - periods_ago, 0.0), rows - 1.0))
 
 
 @compiled
-def measured_loads(observed: Any, gravity: float, is_level: bool, loads: Any) -> None:
-    """Loads by the foot wrenches.
+def measured_loads(observations: Any, gravity: float, is_level: bool, loads: Any) -> None:
+    """Fill in loads by the foot wrenches.
 
     Args:
-        observed: Observations, rows with fields.
-        gravity: Its acceleration [m/s²].
-        is_level: Whether the pelvis is level, or tilted as the IMU says.
+        observations: Rows with fields.
+        gravity: Acceleration of gravity [m/s²].
+        is_level: True for a level pelvis, False for a tilt as the IMU measures it.
         loads: To be filled, rows of `LOADS`.
     """
     for world in range(len(loads)):
         load = loads[world]
-        shown = observed[world]
-        fill_gravity(shown, gravity, is_level, load)
+        obs = observations[world]
+        fill_gravity(obs, gravity, is_level, load)
         for foot in range(2):
             load.mass[foot] = 0.0
             load.point[foot] = 0.0
             for i in range(3):
-                load.wrench[foot, 0, i] = shown.wrench[foot, 0, i]
-                load.wrench[foot, 1, i] = shown.wrench[foot, 1, i]
+                load.wrench[foot, 0, i] = obs.wrench[foot, 0, i]
+                load.wrench[foot, 1, i] = obs.wrench[foot, 1, i]
 
 
 @compiled_part
-def fill_gravity(shown: Any, gravity: float, is_level: bool, load: Any) -> None:
-    """Gravity in the frame of a pelvis that is level or tilted."""
-    turned = (0.0, 0.0, -gravity)
+def fill_gravity(obs: Any, gravity: float, is_level: bool, load: Any) -> None:
+    """Fill in gravity in the frame of a level or tilted pelvis."""
+    in_pelvis = (0.0, 0.0, -gravity)
     if not is_level:
-        roll = shown.imu_attitude[0]
-        turned = gravity_in_pelvis(roll, shown.imu_attitude[1], gravity)
+        in_pelvis = gravity_in_pelvis(obs.imu_attitude[0], obs.imu_attitude[1], gravity)
     for i in range(3):
-        load.gravity[i] = turned[i]
+        load.gravity[i] = in_pelvis[i]
 
 
 @compiled_part
@@ -258,46 +249,46 @@ def gravity_in_pelvis(roll: float, pitch: float, gravity: float) -> Vector:
 
 
 @compiled
-def shift_plan(observed: Any, shift: Array, feet: Any, period_s: float) -> None:
+def shift_plan(observations: Any, shift: Array, feet: Any, period_s: float) -> None:
     """Shift the plan's ZMP in observations, in place, and its load share with it.
 
     Args:
-        observed: Observations, rows with fields, (n,).
-        shift: Of the ZMP in the local frame, x forward and y left, (n, 2) [m].
+        observations: Rows with fields, (n,).
+        shift: Shift of the ZMP in the local frame, x forward and y left, (n, 2) [m].
         feet: Rows of `planned_feet`.
         period_s: Control period [s].
     """
-    for world in range(len(observed)):
-        shown = observed[world]
-        stance = feet[row_of_plan(shown, period_s, 0.0, len(feet))]
+    for world in range(len(observations)):
+        obs = observations[world]
+        stance = feet[plan_row(obs, period_s, 0.0, len(feet))]
         cosine = stance.heading[0]
         sine = stance.heading[1]
-        shown.zmp_reference[0] += cosine * shift[world, 0] - sine * shift[world, 1]
-        shown.zmp_reference[1] += sine * shift[world, 0] + cosine * shift[world, 1]
+        obs.zmp_reference[0] += cosine * shift[world, 0] - sine * shift[world, 1]
+        obs.zmp_reference[1] += sine * shift[world, 0] + cosine * shift[world, 1]
         across = shift_across(shift[world], stance)
-        shown.load_share = shifted_share(shown.load_share, across, stance.spacing)
+        obs.load_share = shifted_share(obs.load_share, across, stance.spacing)
 
 
 @compiled
-def shifted_shares(observed: Any, shift: Array, feet: Any, period_s: float, found: Array) -> None:
-    """Load shares of the right foot after the last control period, under a shifted ZMP.
+def shifted_shares(observations: Any, shift: Array, feet: Any, period_s: float, out: Array) -> None:
+    """Fill in load shares of the right foot after the last control period, under a shifted ZMP.
 
     Args:
-        observed: Observations, rows with fields, (n,).
-        shift: Of the ZMP in the local frame, x forward and y left, (n, 2) [m].
+        observations: Rows with fields, (n,).
+        shift: Shift of the ZMP in the local frame, x forward and y left, (n, 2) [m].
         feet: Rows of `planned_feet`.
         period_s: Control period [s].
-        found: To be filled, (n,).
+        out: To be filled, (n,).
     """
-    for world in range(len(found)):
-        stance = feet[row_of_plan(observed[world], period_s, 1.0, len(feet))]
+    for world in range(len(out)):
+        stance = feet[plan_row(observations[world], period_s, 1.0, len(feet))]
         across = shift_across(shift[world], stance)
-        found[world] = shifted_share(stance.share, across, stance.spacing)
+        out[world] = shifted_share(stance.share, across, stance.spacing)
 
 
 @compiled_part
 def shift_across(shift: Array, stance: Any) -> float:
-    """The part of a shift in the local frame from the right foot towards the left one [m]."""
+    """Part of a shift in the local frame from the right foot towards the left one [m]."""
     return shift[0] * stance.across[0] + shift[1] * stance.across[1]
 
 
@@ -305,9 +296,9 @@ def shift_across(shift: Array, stance: Any) -> float:
 def shifted_share(share: float, shift: float, spacing: float) -> float:
     """Load share of the right foot under a ZMP that is shifted towards the left one.
 
-    On two feet the feet share the weight by the lever, −p/w of it. Towards single support the foot
-    that stands takes over, whose ankle carries the shift, so that the change fades with 4 μ (1 −
-    μ).
+    In double support the feet share the weight by their levers: the share changes by −p/w. Towards
+    single support the ankle of the standing foot carries the shift, and the change fades with
+    4 μ (1 − μ).
 
     Args:
         share: Planned share μ.

@@ -1,8 +1,8 @@
 r"""Dry friction along a desired motion: its direction, and the torque that overcomes it.
 
-At rest nobody knows the sign of dry friction, only that of the motion before. So the direction s
-follows the reference: it turns round over a displacement [Dahl1968], stays at rest, and leaves out
-a dead zone in which the reference may tremble. What the transmission has to pass solves
+At rest the sign of dry friction is known from the last motion only. So the direction s follows the
+reference: it changes over a displacement [Dahl1968], keeps its value at rest, and ignores motion in
+a dead zone. The torque of the transmission solves
 
 .. math:: \tau_J = \tau + s (F_0 + F_s e^{-(\omega / \omega_s)^2} + c |\tau_J|)
 
@@ -17,17 +17,17 @@ from elastic_env.core.signals import Array, Parameter
 from elastic_env.joint.friction import dry_friction, passed_torque
 
 PRESLIDING_RAD = 1e-3
-"""Displacement over which dry friction turns round [rad]."""
+"""Displacement over which dry friction changes its sign [rad]."""
 DEAD_ZONE_RAD = 1.6e-3
-"""Displacement to either side that leaves the direction as it is, for joints whose friction varies:
-more than a count of small servos, which have 4096 a turn [rad].
+"""Displacement to either side that does not change the direction, for joints whose friction varies:
+more than one of the 4096 counts per turn of small servos [rad].
 """
 
 
 def presliding_friction(friction: Array, displacement: Array, coulomb: Parameter) -> Array:
     r"""Coulomb friction with presliding [Dahl1968].
 
-    It turns round over a displacement, and stays at rest.
+    It changes its sign over a displacement, and keeps its value at rest.
 
     .. math:: f_{k+1} = F s + (f_k - F s) e^{-|\Delta q| / x_0}, \quad s = \mathrm{sign}(\Delta q)
 
@@ -58,7 +58,7 @@ class FrictionCompensation:
     """Torque that moves links against the dry friction of their joints.
 
     Attributes:
-        dead_zone: Displacement to either side that leaves the direction as it is, (n,) [rad]. The
+        dead_zone: Displacement to either side that does not change the direction, (n,) [rad]. The
             arguments are attributes too.
 
     Args:
@@ -78,42 +78,41 @@ class FrictionCompensation:
         self.dead_zone = DEAD_ZONE_RAD * ((load_ratio > 0.0) | (static > 0.0))
 
     def begin(self, shape: tuple[int, ...]) -> FrictionMemory:
-        """Memory before any motion, for links of this shape: friction holds neither side."""
+        """Memory before any motion, for links of this shape: friction acts on neither side."""
         zero = np.zeros(shape)
         return FrictionMemory(zero, zero, zero)
 
     def follow(self, displacement: Array, memory: FrictionMemory) -> FrictionMemory:
         """Memory after the reference has moved by Δq, (..., n) [rad]."""
-        way = memory.slack + displacement
-        moved = way - way.clip(-self.dead_zone, self.dead_zone)
+        total = memory.slack + displacement
+        beyond = total - total.clip(-self.dead_zone, self.dead_zone)
         return FrictionMemory(
-            coulomb=presliding_friction(memory.coulomb, moved, self.coulomb),
-            direction=presliding_friction(memory.direction, moved, 1.0),
-            slack=way - moved,
+            coulomb=presliding_friction(memory.coulomb, beyond, self.coulomb),
+            direction=presliding_friction(memory.direction, beyond, 1.0),
+            slack=total - beyond,
         )
 
     def joint_torque(self, torque: Array, speed: Array, memory: FrictionMemory) -> Array:
-        """τ_J, (..., n) [N·m].
+        """Torque τ_J of the transmission, (..., n) [N·m].
 
         Args:
             torque: τ that the links need, (..., n) [N·m].
             speed: ω of the reference, (..., n) [rad/s].
-            memory: After the displacement.
+            memory: Memory after the displacement.
         """
-        known = self._known(torque, speed, memory)
-        return passed_torque(known, memory.direction, 0.0, self.load_ratio)
+        load = self._load_and_friction(torque, speed, memory)
+        return passed_torque(load, memory.direction, 0.0, self.load_ratio)
 
     def share(self, torque: Array, speed: Array, memory: FrictionMemory) -> Array:
-        """∂τ_J/∂τ, (..., n) [1]; arguments as of `passed`."""
-        known = self._known(torque, speed, memory)
-        return 1.0 / (1.0 - memory.direction * self.load_ratio * np.sign(known))
+        """∂τ_J/∂τ, (..., n) [1]; arguments as `joint_torque`."""
+        load = self._load_and_friction(torque, speed, memory)
+        return 1.0 / (1.0 - memory.direction * self.load_ratio * np.sign(load))
 
-    def most_passed(self, torque: Array) -> Array:
+    def largest_joint_torque(self, torque: Array) -> Array:
         """Largest τ_J under loads of either sign at rest, (..., n) [N·m] to (..., n) [N·m]."""
-        friction = self.coulomb + self.static
-        return passed_torque(np.abs(torque), 1.0, friction, self.load_ratio)
+        return passed_torque(np.abs(torque), 1.0, self.coulomb + self.static, self.load_ratio)
 
-    def _known(self, torque: Array, speed: Array, memory: FrictionMemory) -> Array:
+    def _load_and_friction(self, torque: Array, speed: Array, memory: FrictionMemory) -> Array:
         """Load with the friction that does not grow with it, (..., n) [N·m]."""
         excess = dry_friction(
             speed,

@@ -1,4 +1,4 @@
-"""Gravity torque of the assumed rigid model: what the compensators turn into a deflection.
+"""Gravity torque of the assumed rigid model, which the compensators turn into a deflection.
 
 `gravity_torque(q)` and its gradient on (..., n) joint angles, for a whole batch at once: in closed
 form for one hinge, link by link for a tree of them. Both agree to rounding.
@@ -8,16 +8,17 @@ from typing import Any, Literal, Protocol, get_args
 
 import numpy as np
 
-from baselines.compensation.contact_torque import (
-    ContactGravity,
-    ContactMethod,
-)
+from baselines.compensation.contact_torque import ContactGravity, ContactMethod
 from elastic_env.core.errors import ConfigurationError, require_known
 from elastic_env.core.signals import Array
 from elastic_env.rigid.rigid_body import RigidBody, needs_more_than_gravity
 from elastic_env.world.robot_model import RobotModel, WalkerModel
 
 GravityMethod = Literal["hinge", "tree", "com", "ankle", "lumped"]
+_POSES = 500
+"""Random poses of the search for the largest gravity torque."""
+_TRIES = 33
+"""Angles that the search tries for each joint of the best of them."""
 
 
 class GravityModel(Protocol):
@@ -33,11 +34,12 @@ class GravityModel(Protocol):
 
 
 def make_gravity(model: RobotModel, method: GravityMethod | None = None) -> Any:
-    """The gravity torque of a robot by a chosen method; a `GravityModel` after `at(observations)`.
+    """Make the gravity torque of a robot by a chosen method.
 
     A robot on a fixed base has "hinge" (default for one joint) and "tree" (default for several),
-    and is a `GravityModel` at once; a walker has the methods of
-    `baselines.compensation.contact_torque`: "com" (default), "ankle" and "lumped".
+    and its gravity torque is a `GravityModel`. A walker has the methods of
+    `baselines.compensation.contact_torque`: "com" (default), "ankle" and "lumped". Its gravity
+    torque is a `GravityModel` after `at(observations)`.
 
     Raises:
         ConfigurationError: The method does not exist, or not for this robot.
@@ -54,14 +56,14 @@ def make_gravity(model: RobotModel, method: GravityMethod | None = None) -> Any:
         return RigidBody(model.rigid, model.joint_names)
     if is_more_than_gravity:
         raise ConfigurationError(
-            "gravity method 'hinge' knows gravity alone, and this model has springs of joints"
+            "gravity method 'hinge' has gravity only, but this model has springs of joints"
             " or gravcomp; choose tree"
         )
     return HingeTorque(model)
 
 
 class HingeTorque:
-    r"""Torque of a robot with one hinge in closed form, from what `RigidBody` says of three states.
+    r"""Torque of a robot with one hinge in closed form, fitted to three states of `RigidBody`.
 
     .. math:: \tau = I \ddot q + a \cos q + b \sin q
 
@@ -69,14 +71,14 @@ class HingeTorque:
         model: Robot with one joint, about which its inertia I is always the same.
 
     Raises:
-        ConfigurationError: It has more joints.
+        ConfigurationError: The robot has more joints.
     """
 
     def __init__(self, model: RobotModel) -> None:
         names = model.joint_names
         if len(names) != 1:
-            found = f"got {len(names)}: {', '.join(names)}; choose tree"
-            raise ConfigurationError(f"gravity method 'hinge' needs one joint, {found}")
+            got = f"got {len(names)}: {', '.join(names)}; choose tree"
+            raise ConfigurationError(f"gravity method 'hinge' needs one joint, {got}")
         body = RigidBody(model.rigid, names)
         zero = np.zeros(1)
         self._a = body.gravity_torque(zero)
@@ -94,3 +96,27 @@ class HingeTorque:
     def inverse_dynamics(self, q: Array, q_dot: Array, q_ddot: Array) -> Array:  # noqa: ARG002
         """Torque of a motion without friction, from (..., 1) [rad], [rad/s], [rad/s²] to [N·m]."""
         return self._inertia * q_ddot + self.gravity_torque(q)
+
+
+def largest_gravity_torque(body: RigidBody, lowest: Array, highest: Array) -> Array:
+    """Largest gravity torques over the joint ranges, at most a turn wide, (n,) [N·m].
+
+    Args:
+        body: The robot.
+        lowest: Lower ends of the joint ranges, infinite without one, (n,) [rad].
+        highest: Upper ends, likewise.
+    """
+    lowest = np.where(np.isfinite(lowest), lowest, -np.pi)
+    highest = np.where(np.isfinite(highest), highest, np.pi)
+    poses = np.random.default_rng(0).uniform(lowest, highest, (_POSES, len(lowest)))
+    torque = np.abs(body.gravity_torque(poses))
+    largest = torque.max(axis=0)
+    for joint, pose in enumerate(poses[torque.argmax(axis=0)]):
+        for i in range(len(pose)):  # coordinate ascent
+            candidates = np.repeat(pose[None], _TRIES, axis=0)
+            candidates[:, i] = np.linspace(lowest[i], highest[i], _TRIES)
+            torques = np.abs(body.gravity_torque(candidates)[:, joint])
+            if torques.max() > largest[joint]:
+                largest[joint] = torques.max()
+                pose = candidates[torques.argmax()]
+    return largest

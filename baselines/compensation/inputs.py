@@ -1,9 +1,8 @@
 """Named inputs of a base policy: its own quantities in which a residual may act.
 
 Every input has a unit, one column per joint or per axis, and an image in the mirror. Zero gives the
-base to the last bit. An input acts on the quantity that the base itself plans or feeds back, so
-that its feedback does not work against it: a policy that is told to shift its center of mass also
-expects it there.
+bits of the base. An input acts on the quantity that the base itself plans or feeds back, so that
+its feedback does not work against it: a policy with a shifted center of mass also expects it there.
 
 Columns per joint are in the order of the robot's joints. Axes: x forward, y to the left, on the
 walker in the plan's local frame (`elastic_env.motion.walk_plan`).
@@ -25,11 +24,11 @@ class InputKind:
     """Unit, bounds and columns of an input.
 
     Attributes:
-        unit, meaning: In words.
+        unit, meaning: Text for tables and errors.
         default: Bound where none is given.
         limit: Every bound must be below it.
-        axes: Columns that are no joints, and what each is in the mirror; none for an input with a
-            column per joint.
+        axes: Columns that are no joints, and the sign of each in the mirror; None for an input with
+            a column per joint.
     """
 
     unit: str
@@ -60,19 +59,18 @@ INPUTS: Mapping[str, InputKind] = {  # unit, meaning, default, limit, axes
 }
 """All inputs by name.
 
-Every policy has `command`; a policy's `inputs` names the others that it has.
+Every policy has `command`; its attribute `inputs` names the others.
 """
 
 
 def input_signals(name: str, model: RobotModel) -> tuple[Signal, ...]:
-    """The columns of an input as signals, which say what each is in the mirror."""
+    """Columns of an input as signals, with their signs in the mirror."""
     kind = INPUTS[name]
     columns: dict[str, Mirrored | None] = {**(kind.axes or {})}
-    if kind.axes is None:  # a relative change has no direction
+    if kind.axes is None:  # a relative change has no sign in the mirror
         columns = dict.fromkeys(model.joint_names, "same")
     if name == COMMAND:
-        commands = model.observation_table.signals_of("last_command")
-        pairs = zip(columns, commands, strict=True)
+        pairs = zip(columns, model.observation_table.signals_of("last_command"), strict=True)
         columns = {column: signal.mirrored for column, signal in pairs}
     return tuple(
         Signal(f"{name}.{column}", kind.unit, kind.meaning, mirrored=mirrored)

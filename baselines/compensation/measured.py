@@ -1,4 +1,4 @@
-r"""Links that sensors show, in the place of an output compensator.
+r"""Link angles by sensors, instead of an output compensator.
 
 | sensor | deflection | source |
 |---|---|---|
@@ -6,9 +6,8 @@ r"""Links that sensors show, in the place of an output compensator.
 | link encoders | :math:`\delta = \theta - q`, whatever K and load | [10] of the paper, at the hips alone |
 
 A policy sees θ − δ at once. The command must not lead by the measured δ at once: where both feet
-stand, the legs form a closed chain, and δ follows the command by as much as the command changes.
-The command leads by the model's deflection instead, which `baselines.adaptation` corrects slowly by
-what is measured.
+stand, the legs form a closed chain, and δ changes by as much as the command. So the command leads
+by the model's deflection, which `baselines.adaptation` corrects slowly by the measurements.
 """  # noqa: E501
 
 from typing import Any, Self
@@ -16,12 +15,8 @@ from typing import Any, Self
 import numpy as np
 from typing_extensions import override
 
-from baselines.compensation.compensators import (
-    DriveMemory,
-    DynamicCompensator,
-    OutputMethod,
-    shallow_copy,
-)
+from baselines.compensation.compensators import OutputMethod, shallow_copy
+from baselines.compensation.dynamic_compensator import DriveMemory, DynamicCompensator
 from baselines.compensation.gravity_torque import GravityMethod
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array, BoolArray, SignalTable
@@ -36,16 +31,17 @@ def require_sensor(table: SignalTable, sensor: str, group: str | None = None) ->
 
     Args:
         table: The observation.
-        sensor: Name that `gymnasium.make(..., sensors=[...])` has for it.
+        sensor: Its name in `gymnasium.make(..., sensors=[...])`.
         group: Name of its columns; None for the same.
 
     Raises:
-        ConfigurationError: It does not have it.
+        ConfigurationError: The observation does not have the sensor.
     """
     if (group or sensor) not in {name.split(".")[0] for name in table.names}:
-        cure = f"make it with sensors=[{sensor!r}]"
-        lacks = "which the environment does not have"
-        raise ConfigurationError(f"this policy reads {sensor}, {lacks}; {cure}")
+        raise ConfigurationError(
+            f"this policy reads {sensor}, which the environment does not have; make it with"
+            f" sensors=[{sensor!r}]"
+        )
 
 
 class DeflectionSensors:
@@ -54,11 +50,11 @@ class DeflectionSensors:
     Args:
         model: Assumed robot, whose observation has the sensor.
         sensor: "joint_torque" or "link_encoder".
-        joints: Which joints have it, by a part of their names.
+        joints: Parts of the names of joints that have it.
 
     Attributes:
-        has: Which joints have it, (n,).
-        are_torques: They measure torques, not link angles.
+        has: True for joints that have it, (n,).
+        are_torques: True where it measures torques, not link angles.
         modelled: 1 where δ follows from the assumed K, 0 where it does not, (n,) [1].
 
     Raises:
@@ -79,21 +75,20 @@ class DeflectionSensors:
 
     def deflection(self, rows: Array) -> Array:
         """δ = θ − q of observations, (num_worlds, n) [rad]; 0 where a joint has no sensor."""
-        shown = rows[:, self._columns]
+        measured = rows[:, self._columns]
         if self.are_torques:
-            return self.has * (shown / self._stiffness)
-        return self.has * (rows[:, self._encoder] - shown)
+            return self.has * (measured / self._stiffness)
+        return self.has * (rows[:, self._encoder] - measured)
 
 
 class MeasuredCompensator(DynamicCompensator):
-    """A compensator whose links are those of sensors where there are any.
+    """A compensator that takes link angles from sensors where there are any.
 
     Args:
         model: Assumed robot.
-        sensors: Of the joints; links of joints without a sensor follow from the model, and so do
-            all rates.
-        output: As of `DynamicCompensator`.
-        method: As of `DynamicCompensator`.
+        sensors: Sensors of the joints; the model gives the links of other joints, and all rates.
+        output: Argument of `DynamicCompensator`.
+        method: Argument of `DynamicCompensator`.
     """
 
     def __init__(
@@ -112,9 +107,9 @@ class MeasuredCompensator(DynamicCompensator):
 
     @override
     def at(self, rows: Array) -> Self:
-        bound = shallow_copy(super().at(rows))
-        bound._deflection = self._sensors.deflection(rows)
-        return bound
+        compensator = shallow_copy(super().at(rows))
+        compensator._deflection = self._sensors.deflection(rows)
+        return compensator
 
     @override
     def link_angle(self, theta: Array, memory: DriveMemory) -> Array:

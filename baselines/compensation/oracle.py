@@ -1,8 +1,8 @@
-"""The policy that reads the truth: what perfect sensing and a perfect model of the joints give.
+"""Oracle: a policy with perfect sensing and a perfect model of the joints.
 
 On the walker it knows K of every joint, the links, the pelvis' attitude, the foot wrenches, and a
 load that all robots of a scenario have on their shoulders. It does not know a drawn load, a slope,
-a push, or the friction and backlash of drawn robots. Where these count it is no bound.
+a push, or the friction and backlash of drawn robots. Where these matter it is no bound.
 """
 
 from typing import Any, NamedTuple, Self
@@ -10,12 +10,10 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from typing_extensions import override
 
-from baselines.compensation.compensators import (
-    Compensated,
-    DriveMemory,
-    DynamicCompensator,
-)
-from baselines.compensation.policy import Motion, PassingMemory, Policy, PolicyInputs, Step
+from baselines.compensation.compensated import Compensated
+from baselines.compensation.dynamic_compensator import DriveMemory, DynamicCompensator
+from baselines.compensation.observation_view import Motion
+from baselines.compensation.policy import PassingMemory, Policy, PolicyInputs, Step
 from baselines.compensation.startup import Ramp
 from elastic_env.core.errors import ElasticError
 from elastic_env.core.signals import Array, IntArray
@@ -27,12 +25,12 @@ _LIMIT_RAD = 0.05
 
 
 class TrueMemory(NamedTuple):
-    """Memory of the compensator that knows the truth.
+    """Memory of the compensator with the true parameters.
 
     Attributes:
         steps: Control steps since the start of the episode, (num_worlds, 1).
-        correction: Of the integrator, (num_worlds, n) [rad].
-        target: Where the links were to be in the last control step, (num_worlds, n) [rad].
+        correction: Correction by the integrator, (num_worlds, n) [rad].
+        target: Desired link angles of the last control step, (num_worlds, n) [rad].
         drives: Memory of the drives.
     """
 
@@ -45,13 +43,13 @@ class TrueMemory(NamedTuple):
 class TrueCompensator(DynamicCompensator):
     """The dynamic compensator with the true parameters and the true links of an environment.
 
-    What inputs of a policy correct, it knows already.
+    It needs no correction by inputs of a policy.
 
     Args:
         env: The environment itself.
         model: True model of the robot.
         ramp_s: Time after which the integrator begins [s].
-        friction: Whether the compensator knows the friction.
+        friction: True to compensate the friction.
         gain: Gain on the true link error [1/s].
     """
 
@@ -67,22 +65,26 @@ class TrueCompensator(DynamicCompensator):
         self._truth: Any = None
         table = self.model.observation_table
         groups = ("encoder_angle", "encoder_rate", "last_command")
-        self._known = np.concatenate([np.r_[table.group(name)] for name in groups])
+        self._checked = np.concatenate([np.r_[table.group(name)] for name in groups])
 
     @override
     def at(self, rows: Array) -> Self:
-        """The observations must be the environment's present ones."""
-        present = np.atleast_2d(self._env.task.observe())[:, self._known]
-        if not np.array_equal(rows[:, self._known], present):
+        """Compensator for the environment's present observations, (num_worlds, m).
+
+        Raises:
+            ElasticError: Other observations.
+        """
+        present = np.atleast_2d(self._env.task.observe())[:, self._checked]
+        if not np.array_equal(rows[:, self._checked], present):
             raise ElasticError(
                 "the oracle reads the truth of the environment that it was made for, and this is"
                 ' not its present observation; make one with baselines.make("oracle", env) for the'
                 " environment that it is to run in"
             )
         truth = self._env.truth()
-        bound = super().at(rows).with_stiffness(truth.stiffness)
-        bound._truth = truth
-        return bound
+        compensator = super().at(rows).with_stiffness(truth.stiffness)
+        compensator._truth = truth
+        return compensator
 
     @override
     def begin(self, motion: Motion) -> Any:
@@ -95,8 +97,7 @@ class TrueCompensator(DynamicCompensator):
         offset, drives = super().offset(motion, memory.drives)
         if self._gain == 0.0:
             return offset, memory._replace(drives=drives)
-        is_on = self._ramp.is_over(memory.steps)
-        error = np.where(is_on, memory.target - self._truth.q, 0.0)
+        error = np.where(self._ramp.is_over(memory.steps), memory.target - self._truth.q, 0.0)
         correction = memory.correction + self._gain * error
         correction = np.minimum(np.maximum(correction, -_LIMIT_RAD), _LIMIT_RAD)
         memory = TrueMemory(memory.steps + 1, correction, motion.q, drives)
@@ -118,16 +119,16 @@ class TrueCompensator(DynamicCompensator):
 class Oracle(Compensated):
     """Perfect sensing and a perfect model: the only policy that may read the truth.
 
-    The dynamic compensator with the true parameters around a policy that sees the true link angles;
-    on the testbed also an integrator on the true link error for what is left, with a gain below the
-    damping of the link's resonance.
+    It is the dynamic compensator with the true parameters around a policy that sees the true link
+    angles. On the testbed an integrator of the true link error corrects the rest, with a gain below
+    the damping of the link's resonance.
 
     Args:
         env: The environment itself, scalar or vector.
-        policy: What is compensated: on the walker its controller.
+        policy: Policy inside it: on the walker its controller.
         model: True model of the robot; of a walker with the plan that it walks.
         ramp_s: Time in which the compensation grows from zero [s].
-        friction: Whether the compensator knows the friction; not where the policy does.
+        friction: True to compensate the friction; False where the policy does so.
         integral_gain: Gain on the true link error [1/s]; 0 where the policy moves links off the
             reference on purpose.
     """
@@ -147,25 +148,24 @@ class Oracle(Compensated):
 
 
 class TrueSensors(PassingMemory):
-    """A policy of a walker whose IMU and foot sensors show the truth of the environment at once.
+    """A policy of a walker whose IMU and foot sensors measure without error or delay.
 
     Args:
         env: The environment itself, scalar or vector.
-        policy: What commands the robot.
+        policy: Commands the robot.
     """
 
     def __init__(self, env: Any, policy: Policy) -> None:
         self._env = env.unwrapped
         super().__init__(policy, self._env.assumed_model)
         table = self.model.observation_table
-        groups = ("imu_attitude", "imu_rate", "wrench")
-        self._columns = [table.group(group) for group in groups]
+        self._columns = [table.group(group) for group in ("imu_attitude", "imu_rate", "wrench")]
 
     @override
     def act(self, rows: Array, memory: Any, inputs: PolicyInputs) -> Step:
         truth = self._env.truth()
-        seen = rows.copy()
-        shown = (truth.attitude, truth.pelvis_rate, truth.wrench)
-        for columns, values in zip(self._columns, shown, strict=True):
-            seen[:, columns] = values.reshape(len(rows), -1)
-        return self.policy.act(seen, memory, inputs)
+        true_rows = rows.copy()
+        true_values = (truth.attitude, truth.pelvis_rate, truth.wrench)
+        for columns, values in zip(self._columns, true_values, strict=True):
+            true_rows[:, columns] = values.reshape(len(rows), -1)
+        return self.policy.act(true_rows, memory, inputs)

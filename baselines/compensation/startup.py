@@ -1,9 +1,9 @@
-r"""How a compensation grows from zero while the robot stands.
+r"""Growth of a compensation from zero while the robot stands.
 
-The robot begins in static equilibrium without compensation; the compensated one stands elsewhere. A
-walker that is moved there within the second of standing would be left swinging on its springs, so
-its ramp is shaped [Singer1990]: two equal halves, half a period of its slowest sway apart, whose
-swings cancel.
+The robot begins in static equilibrium without compensation. With compensation its equilibrium is
+elsewhere. A walker that moves there within the second of standing would go on swinging on its
+springs, so its ramp is shaped [Singer1990]: two equal halves, half a period of its slowest sway
+apart. Their swings cancel.
 
 [Singer1990] N. C. Singer, W. P. Seering, "Preshaping Command Inputs to Reduce System Vibration", J.
 Dyn. Sys., Meas., Control 112(1).
@@ -16,7 +16,8 @@ from elastic_env.motion.sway import sway_frequencies
 from elastic_env.motion.trajectory import minimum_jerk
 from elastic_env.world.robot_model import RobotModel, WalkerModel
 
-_SHORTEST_SHARE = 0.2
+_SHORTEST_HALF = 0.2
+"""Shortest duration of a half of a shaped ramp, over that of the ramp [1]."""
 
 
 class Ramp:
@@ -37,10 +38,10 @@ class Ramp:
         if isinstance(model, WalkerModel):
             # springs in series with the servos that hold their motor side [N·m/rad]
             servo = np.array([servo.position_gain for servo in model.servos])
-            held = 1.0 / (1.0 / model.stiffness + 1.0 / servo)
-            sway = sway_frequencies(model.biped, model.plan.pelvis[0], held, model.plan.ankles[0])
+            series = 1.0 / (1.0 / model.stiffness + 1.0 / servo)
+            sway = sway_frequencies(model.biped, model.plan.pelvis[0], series, model.plan.ankles[0])
             half_period = np.pi / sway[0]
-            if half_period <= (1.0 - _SHORTEST_SHARE) * duration_s:  # nan is not
+            if half_period <= (1.0 - _SHORTEST_HALF) * duration_s:  # false for nan
                 self._delay = float(half_period)
         steps = np.arange(np.ceil(self._duration / self._period_s) + 2.0)
         self.table = self.share(steps[: int(np.argmax(self.is_over(steps))) + 1])
@@ -48,10 +49,16 @@ class Ramp:
     def share(self, steps: Array) -> Array:
         """Share after a number of control steps, elementwise."""
         time = steps * self._period_s
-        each = self._duration - self._delay
-        second = minimum_jerk((time - self._delay) / each)
-        return 0.5 * (minimum_jerk(time / each) + second)
+        half = self._duration - self._delay
+        second = minimum_jerk((time - self._delay) / half)
+        return 0.5 * (minimum_jerk(time / half) + second)
 
     def is_over(self, steps: Array | IntArray) -> BoolArray:
         """True where the compensation is complete."""
         return steps * self._period_s >= self._duration
+
+
+def feedback_ramp(ramp_s: float, period_s: float) -> Array:
+    """Share of a feedback after 0, 1, ... control steps, growing from 0 to 1 within `ramp_s`."""
+    steps = max(round(ramp_s / period_s), 1)
+    return minimum_jerk(np.arange(steps + 1) / steps)

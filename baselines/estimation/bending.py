@@ -1,15 +1,15 @@
-r"""Model error of a walker's bending joints, from what motors and IMU disagree on.
+r"""Model error of a walker's bending joints, from the disagreement of motors and IMU.
 
 A sole lies flat on the ground. By the motors' angles θ and the attitude of the IMU it seems to be
-tilted: by what the joints of its leg bend, δ = θ − q about their axes z, and by what never changes,
-the tilt of the ground and the errors of homing and of the mounting,
+tilted: by the bending of the joints of its leg, δ = θ − q about their axes z, and by a constant c
+of the tilt of the ground and the errors of homing and mounting,
 
 .. math:: e = \sum_j z_j \delta_j + c
 
-The model and the measured foot wrenches say how much bending to expect, s = Σ z_j K⁻¹τ_j. With a
-common relative error ρ of that leg's model, e = (1 + ρ) s + c. Bending comes and goes with the load
-and c does not, so that recursive least squares over the time that a foot is loaded tell ρ from c,
-for roll and pitch of each leg [Kalman1960, without drift].
+The model and the measured foot wrenches give the expected bending, s = Σ z_j K⁻¹τ_j. With a common
+relative error ρ of that leg's model, e = (1 + ρ) s + c. Bending changes with the load and c does
+not. So recursive least squares over the time that a foot is loaded separate ρ from c, for roll and
+pitch of each leg [Kalman1960, without drift].
 
 [Kalman1960] R. E. Kalman, "A New Approach to Linear Filtering and Prediction Problems", J. Basic
 Eng. 82.
@@ -21,13 +21,14 @@ from typing import Any
 import numpy as np
 
 from baselines.compensation.compensators import GravityCompensator
-from baselines.compensation.policy import Records, WalkView
+from baselines.compensation.observation_view import WalkView
+from baselines.compensation.records import Records
 from elastic_env.core.compiled import compiled, compiled_part, record_type
 from elastic_env.core.signals import Array, Signal
 from elastic_env.world.robot_model import WalkerModel
 
 LOADED_SHARE = 0.15
-"""Share of the weight from which an estimate takes a foot for loaded, and flat on the ground."""
+"""Share of the weight from which on a foot counts as loaded, and flat on the ground."""
 MODEL_ERROR = 0.3
 OFFSET_RAD = 0.02
 DISAGREEMENT_RAD = 0.002
@@ -51,7 +52,8 @@ class BendingObserver:
     Args:
         model: Assumed walker.
 
-    Attribute `carried` is the force that the feet carry [N].
+    Attributes:
+        carried: Force that the feet carry [N].
     """
 
     signals = tuple(
@@ -87,18 +89,17 @@ class BendingObserver:
 
         Args:
             rows: Observations, (num_worlds, m).
-            memory: (num_worlds,).
-            bending: Of the joints as the model has it, (num_worlds, 12) [rad]; None for that under
-                the foot wrenches.
+            memory: Rows of `ESTIMATE`, (num_worlds,).
+            bending: Bending of the joints by the model, (num_worlds, 12) [rad]; None for the
+                bending under the foot wrenches.
         """
         if bending is None:
             bending = self.bending(rows)
-        seen, expected = self.disagreement(rows, bending)
+        measured, expected = self.disagreement(rows, bending)
         memory = memory.copy()
-        found = np.empty((len(rows), len(self.signals)))
-        observed = self._view.fields(rows)
-        regress(observed, seen, expected, self.carried, memory, found)
-        return found, memory
+        estimates = np.empty((len(rows), len(self.signals)))
+        regress(self._view.fields(rows), measured, expected, self.carried, memory, estimates)
+        return estimates, memory
 
     def bending(self, rows: Array) -> Array:
         """Expected bending under the measured foot wrenches, δ = θ − q, (num_worlds, 12) [rad]."""
@@ -106,15 +107,15 @@ class BendingObserver:
         return theta - self._compensator.at(rows).link_angle(theta)
 
     def expected_tilt(self, rows: Array) -> Array:
-        """Tilt of the pelvis over each flat foot by the bending, s, (num_worlds, 2, 2) [rad]."""
+        """Tilt of the pelvis over each flat foot by bending, s, (num_worlds, 2, 2) [rad]."""
         return self.disagreement(rows, self.bending(rows))[1]
 
     def disagreement(self, rows: Array, bending: Array) -> Array:
-        """Tilt of a flat foot's sole by motors and IMU, e, and the bending that is expected, s.
+        """Tilt of a flat foot's sole by motors and IMU, e, and the expected bending, s.
 
         Args:
             rows: Observations, (num_worlds, m).
-            bending: Of the joints, (num_worlds, 12) [rad].
+            bending: Bending of the joints, (num_worlds, 12) [rad].
 
         Returns:
             Both, (2, num_worlds, 2 legs, 2), roll and pitch [rad].
@@ -125,42 +126,49 @@ class BendingObserver:
 
 @compiled
 def regress(
-    observed: Any, seen: Array, expected: Array, carried_n: float, memory: Any, found: Array
+    observations: Any,
+    measured: Array,
+    expected: Array,
+    carried_n: float,
+    memory: Any,
+    estimates: Array,
 ) -> None:
-    """A step of recursive least squares for seen − expected = ρ · expected + c of loaded feet.
+    """Update estimates by recursive least squares for measured − expected = ρ · expected + c.
+
+    Only loaded feet count.
 
     Args:
-        observed: Observations, rows with fields.
-        seen: Tilts of the soles, (n, 2, 2) [rad].
-        expected: Tilts that are expected, (n, 2, 2) [rad].
+        observations: Rows with fields.
+        measured: Tilts of the soles by motors and IMU, (n, 2, 2) [rad].
+        expected: Tilts by the expected bending, (n, 2, 2) [rad].
         carried_n: Force that the feet carry [N].
         memory: Rows of `ESTIMATE`, to be updated, (n,).
-        found: To be filled, (n, 9): ρ of legs and axes, their standard deviations, measured over
-            assumed load less one.
+        estimates: To be filled, (n, 9): ρ of legs and axes, their standard deviations, measured
+            over assumed load less one.
     """
-    for world in range(len(found)):
+    for world in range(len(estimates)):
         load = 0.0
         for leg in range(2):
-            force = observed[world].wrench[leg, 0, 2]
+            force = observations[world].wrench[leg, 0, 2]
             load += force
             for axis in range(2):
                 x = memory[world].unknowns[leg, axis]
                 P = memory[world].covariance[leg, axis]
                 if force >= LOADED_SHARE * carried_n:
                     at = (world, leg, axis)
-                    update(x, P, expected[at], seen[at], DISAGREEMENT_RAD)
-                found[world, 2 * leg + axis] = x[0]
-                found[world, 4 + 2 * leg + axis] = math.sqrt(P[0])
-        found[world, 8] = load / carried_n - 1.0
+                    update(x, P, expected[at], measured[at], DISAGREEMENT_RAD)
+                estimates[world, 2 * leg + axis] = x[0]
+                estimates[world, 4 + 2 * leg + axis] = math.sqrt(P[0])
+        estimates[world, 8] = load / carried_n - 1.0
 
 
 @compiled_part
-def update(x: Array, P: Array, expected: float, seen: float, sigma: float) -> None:
-    """Take in a measurement of (expected, 1) · x = seen − expected with a standard deviation."""
+def update(x: Array, P: Array, expected: float, measured: float, sigma: float) -> None:
+    """Update by a measurement of (expected, 1) · x = measured − expected, with its deviation."""
     first = P[0] * expected + P[1]
     second = P[1] * expected + P[2]
     variance = (expected * first + second) + sigma**2
-    error = (seen - expected) - (expected * x[0] + x[1])
+    error = (measured - expected) - (expected * x[0] + x[1])
     gain = first / variance
     second_gain = second / variance
     x[0] += gain * error

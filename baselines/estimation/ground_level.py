@@ -1,28 +1,27 @@
-r"""IMU and foot sensors of a walker as they would be on level ground.
+r"""IMU and foot sensors of a walker, corrected to level ground.
 
-Seen from feet that lie flat, the force of the ground f carries the mass and accelerates it. What is
-left of its direction when the acceleration of the center of mass c is taken off is the tilt of the
-ground λ, whatever the joints bend:
+In the frame of feet that lie flat, the force of the ground f carries the mass and accelerates it.
+Its direction without the acceleration of the center of mass c is the tilt of the ground λ. It does
+not depend on the bending of the joints:
 
 .. math:: \lambda = \overline{f_{xy} / f_z - \ddot c_{xy} / g}
 
-as rotations about x and y (λ_y, −λ_x). f is in the frame of the feet and c in that of the pelvis,
-which is parallel to them but for what the joints bend. The mean of the acceleration over a time t
-is a difference of velocities, known from the motors to some σ_v, so that with σ_λ before any
-measurement the best estimate is λ / (1 + (σ_v / g t σ_λ)²). The weight leans too, and acts at the
-center of mass, h over the ankles: set upright, it leaves the ankles with the wrenches of level
-ground,
+as rotations about x and y (λ_y, −λ_x). f is in the frame of the feet and c in the one of the
+pelvis, which is parallel except for the bending of the joints. The mean of the acceleration over a
+time t is a difference of velocities, which the motors give with a standard deviation σ_v. With the
+prior σ_λ the best estimate is λ / (1 + (σ_v / g t σ_λ)²). The weight leans too, and acts at the
+center of mass, h over the ankles. Set upright, it gives the wrenches of level ground at the ankles,
 
 .. math:: f' = R f, \qquad m' = m + h \hat z \times (f' - f)
 
-A weight that leans bends the legs further than one that is upright, s and s' by the model
-(`baselines.estimation.bending`), each leg by its share w of the load. Level ground would not show
-that either, so that what the robot tilts by itself is
+A leaning weight bends the legs further than an upright one, s and s' by the model
+(`baselines.estimation.bending`), each leg by its share w of the load. Level ground excludes that
+too, so that the robot's own tilt is
 
 .. math:: \text{attitude} - \lambda - \sum_{legs} w (s - s')
 
-On two feet that is too much about x, where a leaning weight goes from one foot to the other rather
-than to the ankles.
+In double support this overestimates the tilt about x, where a leaning weight changes the load
+shares instead of bending the ankles.
 """
 
 from typing import Any, NamedTuple
@@ -37,11 +36,10 @@ from elastic_env.world.robot_model import WalkerModel
 
 TILT_RAD = 0.01
 VELOCITY_M_PER_S = 0.07
-"""σ_λ and σ_v: what the ground is tilted by before the first measurement, and how well
-velocities are known.
-"""
+"""Standard deviations σ_λ of the tilt before the first measurement, and σ_v of a velocity."""
 
 _DIFFERENCE_S = 1e-3
+"""Time step of finite differences [s]."""
 
 
 class GroundMemory(NamedTuple):
@@ -50,7 +48,7 @@ class GroundMemory(NamedTuple):
     Attributes:
         number: Measurements in the mean, (num_worlds,).
         mean: Mean of the tilt about x and y, (num_worlds, 2) [rad].
-        velocity: Last one of the center of mass, (num_worlds, 2) [m/s]; nan before the first.
+        velocity: Last velocity of the center of mass, (num_worlds, 2) [m/s]; nan before the first.
     """
 
     number: Array
@@ -64,15 +62,15 @@ class GroundLevel:
     Args:
         model: Assumed walker.
         period_s: Time between measurements [s].
-        mean_s: Time constant of the mean, after as much time [s].
+        mean_s: Time constant of the mean [s]; before as much time, all measurements count equally.
     """
 
     def __init__(self, model: WalkerModel, period_s: float, mean_s: float = 6) -> None:
         table = model.observation_table
         self._attitude = table.group("imu_attitude")
         self._wrench = table.group("wrench")
-        own = rename_group(table.signals_of("imu_attitude"), "own_tilt")
-        self.signals = (*own, *rename_group(table.signals_of("wrench"), "level_wrench"))
+        own_tilt = rename_group(table.signals_of("imu_attitude"), "own_tilt")
+        self.signals = (*own_tilt, *rename_group(table.signals_of("wrench"), "level_wrench"))
         """Values of `observe`."""
         self._theta = table.group("encoder_angle")
         self._rate = table.group("encoder_rate")
@@ -93,17 +91,17 @@ class GroundLevel:
 
         Args:
             rows: Observations, (num_worlds, m).
-            memory: That of the last measurement.
+            memory: Memory of the last measurement.
         """
-        lean, wrenches, memory = self.upright(rows, memory)
+        tilt, wrenches, memory = self.upright(rows, memory)
         level = rows.copy()
-        level[:, self._attitude] -= lean
+        level[:, self._attitude] -= tilt
         level[:, self._wrench] = wrenches
         load = np.maximum(rows[:, self._wrench].reshape(-1, 2, 2, 3)[:, :, 0, 2], 0.0)
         share = load / np.maximum(load.sum(axis=1, keepdims=True), self._least_n)
         further = self._bending.expected_tilt(rows) - self._bending.expected_tilt(level)
-        own = level[:, self._attitude] - (share[..., None] * further).sum(axis=1)
-        return np.hstack([own, wrenches]), memory
+        own_tilt = level[:, self._attitude] - (share[..., None] * further).sum(axis=1)
+        return np.hstack([own_tilt, wrenches]), memory
 
     def upright(self, rows: Array, memory: GroundMemory) -> tuple[Array, Array, Any]:
         """Tilt of the ground [rad], level foot wrenches, (num_worlds, 12), and new memory."""
@@ -115,28 +113,26 @@ class GroundLevel:
         mean, number = self._mean(force.sum(axis=1), velocity, memory)
         change = self._gravity * TILT_RAD * self._period_s * number
         certainty = change**2 / (change**2 + VELOCITY_M_PER_S**2)
-        lean = mean * certainty[:, None]
-        R = rotation_of_tilt(lean)
-        upright = force @ R.swapaxes(-1, -2)
+        tilt = mean * certainty[:, None]
+        upright = force @ rotation_of_tilt(tilt).swapaxes(-1, -2)
         x, y = np.moveaxis(over_ankles * (upright - force)[..., :2], -1, 0)
-        turned = moment + np.stack([-y, x, np.zeros_like(x)], axis=-1)
-        wrenches = np.stack([upright, turned], axis=2).reshape(n, -1)
-        return lean, wrenches, GroundMemory(number, mean, velocity)
+        level_moment = moment + np.stack([-y, x, np.zeros_like(x)], axis=-1)
+        wrenches = np.stack([upright, level_moment], axis=2).reshape(n, -1)
+        return tilt, wrenches, GroundMemory(number, mean, velocity)
 
     def _mean(self, force: Array, velocity: Array, memory: Any) -> tuple[Array, Array]:
-        """The mean after a measurement, about x and y [rad], and of how many it is."""
-        has_velocity = np.isfinite(memory.velocity).all(axis=1)
-        is_known = (force[:, 2] >= self._least_n) & has_velocity
+        """Mean after a measurement, about x and y [rad], and the number of measurements in it."""
+        is_known = (force[:, 2] >= self._least_n) & np.isfinite(memory.velocity).all(axis=1)
         accelerated = (velocity - memory.velocity) / (self._period_s * self._gravity)
         direction = force[:, :2] / np.where(is_known, force[:, 2], np.inf)[:, None]
-        seen = direction - np.where(is_known[:, None], accelerated, 0.0)
+        lean = direction - np.where(is_known[:, None], accelerated, 0.0)
         number = memory.number + is_known
         gain = is_known * np.maximum(1.0 / np.maximum(number, 1.0), self._least_gain)
-        tilt = np.stack([seen[:, 1], -seen[:, 0]], axis=1)
+        tilt = np.stack([lean[:, 1], -lean[:, 0]], axis=1)
         return memory.mean + gain[:, None] * (tilt - memory.mean), number
 
     def _center_of_mass(self, rows: Array, load: Array) -> tuple[Array, Array]:
-        """Center of mass on the ankles: height [m], and velocity against the loaded one [m/s].
+        """Center of mass over the ankles: height [m], and velocity against the loaded one [m/s].
 
         Shapes are (n, 2, 1) and (n, 2).
         """
@@ -145,6 +141,6 @@ class GroundLevel:
         com, ankles = self._carried.com_and_feet(
             np.concatenate([theta, theta + _DIFFERENCE_S * rate])
         )
-        now, soon = np.split(com[:, None] - ankles, 2)
-        velocity = (soon - now)[..., :2] / _DIFFERENCE_S
-        return now[..., 2:], velocity[np.arange(len(rows)), np.argmax(load, axis=1)]
+        present, future = np.split(com[:, None] - ankles, 2)
+        velocity = (future - present)[..., :2] / _DIFFERENCE_S
+        return present[..., 2:], velocity[np.arange(len(rows)), np.argmax(load, axis=1)]

@@ -1,1 +1,1 @@
-"""Residuals: what they correct, what they see, their networks and their folders."""
+"""Residuals: corrections of a base policy, their features, networks and folders."""

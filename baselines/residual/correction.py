@@ -1,9 +1,9 @@
-"""A base policy under a residual: what the residual acts on, and how fast it can change.
+"""A base policy under a residual: the inputs that the residual acts on, and its low-pass.
 
 The residual is a number in [−1, 1] for every column of the inputs that it acts on, or for every
-pair of joints. It is decided from the features of `baselines.residual.features` once in
-`decision_period` control steps. Times the bound of its column it passes a first-order low-pass, and
-becomes an input of the base (`baselines.compensation.inputs`).
+pair of joints. A decision takes place once in `decision_period` control steps, by the features of
+`baselines.residual.features`. The residual times the bound of its column passes a first-order
+low-pass, and is an input of the base (`baselines.compensation.inputs`).
 """
 
 from collections.abc import Callable, Sequence
@@ -12,8 +12,8 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-from baselines.compensation import inputs as named_inputs
-from baselines.compensation.inputs import COMMAND, INPUTS, InputKind
+from baselines.compensation.inputs import COMMAND, INPUTS, InputKind, input_signals, inputs_of
+from baselines.compensation.memory import resume_memory
 from baselines.compensation.policy import (
     NO_INPUTS,
     ONE_WORLD,
@@ -21,7 +21,6 @@ from baselines.compensation.policy import (
     Step,
     as_action,
     as_batch_policy,
-    resume_memory,
 )
 from baselines.residual.settings import ResidualSettings
 from elastic_env.core.errors import ConfigurationError, unknown_name
@@ -29,7 +28,7 @@ from elastic_env.core.signals import Array, BoolArray, Signal
 from elastic_env.world.robot_model import RobotModel
 
 Truth: TypeAlias = Callable[[], Sequence[Any]]
-"""True states and parameters now, of one environment's worlds after the other's."""
+"""Present true states and parameters, one entry per environment of a mixture."""
 
 
 class CorrectedMemory(NamedTuple):
@@ -40,16 +39,16 @@ class CorrectedMemory(NamedTuple):
 
 
 class Corrected:
-    """A base policy under a residual that somebody else decides.
+    """A base policy under a residual, which the caller decides.
 
     Args:
         base: Any policy that has the inputs; every policy has `command`.
-        model: What may be known of the robot.
-        settings: How the residual acts.
-        truth: What a teacher sees by, see `baselines.residual.true_robot.truth_of`.
+        model: Assumed robot.
+        settings: Settings of the residual.
+        truth: Truth for a teacher, see `baselines.residual.true_robot.truth_of`.
 
     Raises:
-        ConfigurationError: An input that the base does not have, or a joint that the robot has not.
+        ConfigurationError: The base does not have an input, or the robot does not have a joint.
     """
 
     def __init__(
@@ -59,11 +58,11 @@ class Corrected:
         settings: ResidualSettings,
         truth: Truth | None = None,
     ) -> None:
-        has = named_inputs.inputs_of(base)
-        if lacking := [name for name in settings.acts_on if name not in has]:
+        inputs = inputs_of(base)
+        if missing := [name for name in settings.acts_on if name not in inputs]:
             raise ConfigurationError(
-                f"the residual acts on {', '.join(lacking)}, which {type(base).__name__} does not"
-                f" have as an input; it has: {', '.join(has)}"
+                f"the residual acts on {', '.join(missing)}, which {type(base).__name__} does not"
+                f" have as an input; it has: {', '.join(inputs)}"
             )
         self.base = as_batch_policy(base, model)
         self.settings = settings
@@ -71,16 +70,13 @@ class Corrected:
         self.truth = truth
         self.view = self.base.view
         self.channels = Channels(model, settings)
-        turns = settings.cutoff_hz * model.control_period_s
-        self._share = 1.0 - float(np.exp(-2.0 * np.pi * turns))
-
-    @property
-    def num_residuals(self) -> int:
-        """Numbers that make up a residual, k."""
-        return len(self.channels.signals)
+        self.num_residuals = len(self.channels.signals)
+        """Number k of values in a residual."""
+        cycles = settings.cutoff_hz * model.control_period_s
+        self._filter_share = 1.0 - float(np.exp(-2.0 * np.pi * cycles))
 
     def begin(self, rows: Array) -> CorrectedMemory:
-        """Memory at the start of an episode, whose first observations are rows, (num_worlds, m)."""
+        """Memory at the start of an episode with these first observations, (num_worlds, m)."""
         values = np.zeros((len(rows), len(self.channels.bounds)))
         return CorrectedMemory(values, self.base.begin(rows))
 
@@ -89,8 +85,8 @@ class Corrected:
     ) -> tuple[Action, Any]:
         """Action and new state under a residual, (num_worlds, k) within [−1, 1].
 
-        A residual that has been zero since the start of the episode gives the base's action to the
-        last bit.
+        A residual that has been zero since the start of the episode gives the bits of the base's
+        action.
         """
         rows = self.view.rows(observation)
         memory = resume_memory(self, rows, state, episode_start)
@@ -104,10 +100,10 @@ class Corrected:
         Args:
             rows: Observations, (num_worlds, m).
             residual: Within [−1, 1], (num_worlds, k).
-            memory: That of the last control step.
-            inputs: How `predict` was called; the residual sets their values.
+            memory: Memory of the last control step.
+            inputs: Arguments of `predict`; the residual sets the values of the inputs.
         """
-        values = self.channels.approach(memory.values, residual, self._share)
+        values = self.channels.approach(memory.values, residual, self._filter_share)
         parts = self.channels.parts(values)
         offset = parts.pop(COMMAND, None)
         action, inner = self.base.act(rows, memory.inner, inputs._replace(**parts))
@@ -122,27 +118,25 @@ class Corrected:
 
     def base_action(self, rows: Array, state: Any, episode_start: Any) -> Array:
         """Command of the base alone, (num_worlds, n) [rad]."""
-        memory = self.base_memory(rows, state, episode_start)
-        return self.base.act(rows, memory, NO_INPUTS)[0]
+        return self.base.act(rows, self.base_memory(rows, state, episode_start), NO_INPUTS)[0]
 
     def link_estimate(self, observation: Array, state: Any) -> Array:
-        """Estimated link angle for an observation and the state after it, (..., n) [rad]."""
+        """Estimated link angles for an observation and the state after it, (..., n) [rad]."""
         return self.base.link_estimate(observation, state.inner)
 
 
 class Channels:
-    """Columns on which a residual acts, those of one input after the other.
+    """Columns on which a residual acts, input after input.
 
     Args:
-        model: What may be known of the robot.
-        settings: How the residual acts.
+        model: Assumed robot.
+        settings: Settings of the residual.
 
     Attributes:
-        signals: The numbers of a residual, (k,), as signals; those that left and right share have
-            no side.
+        signals: Values of a residual as signals, (k,); shared by left and right they have no side.
         bounds: Bound of every column, (width,); zero where the residual does not act.
-        source: Number of the residual that each column follows, (width,).
-        columns: What the columns are, (width,).
+        source: Number of the value that each column follows, (width,).
+        columns: Signals of the columns, (width,).
 
     Raises:
         ConfigurationError: A joint or an axis that does not exist, or a joint without a bound.
@@ -152,35 +146,35 @@ class Channels:
         signals: dict[str, Signal] = {}
         bounds: list[float] = []
         sources: list[str | None] = []
-        acted: list[Signal] = []
+        columns: list[Signal] = []
         self._columns: dict[str, slice] = {}
         for name in settings.acts_on:
             first = len(bounds)
-            of_input = _bounds(name, settings, model.joint_names).tolist()
-            columns = named_inputs.input_signals(name, model)
-            for column, bound in zip(columns, of_input, strict=True):
+            input_bounds = _column_bounds(name, settings, model.joint_names).tolist()
+            input_columns = input_signals(name, model)
+            for column, bound in zip(input_columns, input_bounds, strict=True):
                 shared = settings.shared and INPUTS[name].axes is None
                 source = _without_side(column.name) if shared else column.name
                 if bound > 0.0:
                     signals.setdefault(source, column)
                 sources.append(source if bound > 0.0 else None)
-            bounds += of_input
-            acted += columns
+            bounds += input_bounds
+            columns += input_columns
             self._columns[name] = slice(first, len(bounds))
         self.bounds = np.array(bounds)
-        self.columns = tuple(acted)
+        self.columns = tuple(columns)
         order = {name: number for number, name in enumerate(signals)}
         self.source = np.array([order.get(source or "", 0) for source in sources])
         ends = {"low": -1.0, "high": 1.0}
-        self.signals = tuple(replace(own, name=name, **ends) for name, own in signals.items())
+        self.signals = tuple(replace(s, name=name, **ends) for name, s in signals.items())
 
     def approach(self, values: Array, residual: Array, share: float) -> Array:
         """Values of all columns after a share of their way to a residual, (num_worlds, width).
 
         Args:
-            values: Before.
+            values: Values before.
             residual: Within [−1, 1], (num_worlds, k).
-            share: 1 for all of the way.
+            share: 1 for the whole way.
         """
         return values + share * (self.bounds * residual.take(self.source, axis=1) - values)
 
@@ -189,7 +183,7 @@ class Channels:
         return {name: values[..., columns] for name, columns in self._columns.items()}
 
 
-def _bounds(name: str, settings: ResidualSettings, joint_names: list[str]) -> Array:
+def _column_bounds(name: str, settings: ResidualSettings, joint_names: list[str]) -> Array:
     """Bound of every column of an input, (columns,); zero where the residual does not act."""
     kind = INPUTS[name]
     bound = settings.bounds[name]
@@ -212,19 +206,18 @@ def _bounds(name: str, settings: ResidualSettings, joint_names: list[str]) -> Ar
 
 
 def fit_columns(wanted: str, names: list[str], kind: InputKind) -> BoolArray:
-    """Columns that are called so, or whose names end so.
+    """Columns with this name or ending of a name, a mask.
 
     Raises:
         ConfigurationError: There is none.
     """
     fits = np.array([name == wanted or name.endswith(f"_{wanted}") for name in names])
     if not fits.any():
-        what = "joint" if kind.axes is None else "axis of an input"
-        raise unknown_name(what, wanted, names)
+        raise unknown_name("joint" if kind.axes is None else "axis of an input", wanted, names)
     return fits
 
 
 def _without_side(name: str) -> str:
-    """A column's name without its side."""
+    """Name of a column without its side."""
     group, _, part = name.partition(".")
     return f"{group}.{part.removeprefix('l_').removeprefix('r_')}"

@@ -1,19 +1,19 @@
 """Features that decide a residual: from the observation, the plan and the model.
 
-| name | what it is |
+| name | meaning |
 |---|---|
-| a group or a signal of the observation, such as `clock` or `clock.swing` | as it is in the observation |
-| `observation` | all of them |
-| `encoder_error` | encoder angles less reference angles, which are small beside both [rad] |
+| a group or a signal of the observation, such as `clock` or `clock.swing` | the same |
+| `observation` | all groups |
+| `encoder_error` | encoder angles less reference angles, which are small compared with both [rad] |
 | `link_error` | with encoders on the links: reference angles less the links' angles, small too [rad] |
 | `contact_error` | walker: measured ZMP [m] and load share [1] as on level ground, less the planned ones |
 | `zmp_error` | walker: measured ZMP of flat feet less the planned one [m], whatever the ground's tilt adds |
 | `zmp_of_steps` | walker: mean `zmp_error` in the last step on either foot |
 | `level` | walker: attitude and foot wrenches as on level ground (`baselines.estimation.ground_level`) |
-| `bending` | walker: how much more the joints bend than the model says, and the load (`baselines.estimation.bending`) |
+| `bending` | walker: relative error of the model's bending, and the load (`baselines.estimation.bending`) |
 | `phase` | walker: the first eight harmonics of the phase of a step [1] |
-| `standing`, `zmp_offset`, `feet`, `landing`, `shear` | what a base such as `foothold` has learned of the robot, from its memory |
-| `base_action` | what the base alone would command now [rad] |
+| `standing`, `zmp_offset`, `feet`, `landing`, `shear` | estimates of the robot by a base such as `foothold`, from its memory |
+| `base_action` | present command of the base alone [rad] |
 """  # noqa: E501
 
 from collections.abc import Callable
@@ -23,23 +23,19 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from baselines.compensation.policy import ObservationView, put_rows, select_rows
+from baselines.compensation.memory import put_rows, select_rows
+from baselines.compensation.observation_view import ObservationView
 from baselines.estimation.bending import BendingObserver
 from baselines.estimation.ground_level import GroundLevel, GroundMemory
 from baselines.residual.correction import Corrected
 from baselines.residual.mirror import LeftFirst
 from baselines.residual.true_robot import true_robot
+from baselines.walking.flat_feet import LEAST_LOAD, FlatFeet
 from baselines.walking.foothold import OF_FEET
-from baselines.walking.mean_zmp import IN_PLANE, LEAST_LOAD, FlatFeet
 from baselines.walking.phase_table import harmonics, stride_angle
+from baselines.walking.zmp_offset import IN_PLANE
 from elastic_env.core.errors import ConfigurationError, unknown_name
-from elastic_env.core.signals import (
-    Array,
-    BoolArray,
-    Signal,
-    SignalGroup,
-    rename_group,
-)
+from elastic_env.core.signals import Array, BoolArray, Signal, SignalGroup, rename_group
 from elastic_env.motion.trajectory import STAND_S
 from elastic_env.world.robot_model import RobotModel, WalkerModel
 
@@ -48,9 +44,11 @@ BASE_ACTION = "base_action"
 
 
 class FeaturesMemory(NamedTuple):
-    """Measurements of the last decisions, (num_worlds, history · k), the latest first.
+    """Memory of the features.
 
-    Memory of the sources.
+    Attributes:
+        past: Measurements of the last decisions, (num_worlds, history · k), the latest first.
+        sources: Memory of the sources.
     """
 
     past: Array
@@ -60,14 +58,14 @@ class FeaturesMemory(NamedTuple):
 class Features:
     """Features that decide a residual, in the order of the settings.
 
-    What a teacher sees behind them; the base's action and earlier measurements last.
+    After them come the truth of a teacher, the base's action, and earlier measurements.
 
     Args:
         corrected: The base and its correction.
 
     Attributes:
-        signals: Those of the decision.
-        columns: All of them; `NAME@-k` is a measurement of k decisions ago.
+        signals: Signals of the present decision.
+        columns: All features; `NAME@-k` is a measurement of k decisions ago.
         mirror: Shows steps on the right foot as steps on the left; None without.
 
     Raises:
@@ -82,96 +80,85 @@ class Features:
         names = _source_names(settings.observe, model)
         self._sources = [_source(name, corrected, period_s) for name in names]
         if settings.privileged:
-            signals, see = true_robot(settings.privileged, model, corrected.truth)
-            self._sources.append(_Instant(signals, lambda rows: see()))  # noqa: ARG005
-        self._of_base = [getattr(source, "reads_base", False) for source in self._sources]
-        self._acts = BASE_ACTION in settings.observe
-        seen = [signal for source in self._sources for signal in source.signals]
-        self._measured = np.flatnonzero([signal.kind == "measured" for signal in seen])
+            signals, read_truth = true_robot(settings.privileged, model, corrected.truth)
+            self._sources.append(_Instant(signals, lambda rows: read_truth()))  # noqa: ARG005
+        self._reads_base = [getattr(source, "reads_base", False) for source in self._sources]
+        self._has_action = BASE_ACTION in settings.observe
+        present = [signal for source in self._sources for signal in source.signals]
+        self._measured = np.flatnonzero([signal.kind == "measured" for signal in present])
         self._history = settings.history
         commands = model.observation_table.signals_of("last_command")
-        acts = rename_group(commands, BASE_ACTION) if self._acts else ()
-        self.signals = (*seen, *acts)
-        measured = [seen[i] for i in self._measured]
+        action = rename_group(commands, BASE_ACTION) if self._has_action else ()
+        self.signals = (*present, *action)
+        measured = [present[i] for i in self._measured]
         earlier = [
             replace(signal, name=f"{signal.name}@-{k + 1}")
             for k in range(self._history)
             for signal in measured
         ]
         self.columns = (*self.signals, *earlier)
-        self.mirror = LeftFirst(self.columns, corrected) if settings.mirror else None
-
-    @property
-    def width(self) -> int:
+        self.width = len(self.columns)
         """Number of features."""
-        return len(self.columns)
+        self.mirror = LeftFirst(self.columns, corrected) if settings.mirror else None
 
     def begin(self, num_worlds: int) -> FeaturesMemory:
         """Memory before the first decision."""
         past = np.zeros((num_worlds, self._history * len(self._measured)))
-        sources = [source.begin(num_worlds) for source in self._sources]
-        return FeaturesMemory(past, tuple(sources))
+        return FeaturesMemory(past, tuple(source.begin(num_worlds) for source in self._sources))
 
     def at(
-        self, rows: Array, memory: Any, fresh: BoolArray, state: Any, episode_start: Any
+        self, rows: Array, memory: Any, is_first: BoolArray, state: Any, episode_start: Any
     ) -> tuple[Array, FeaturesMemory]:
         """Features of a decision, and the memory for the next one.
 
         Args:
             rows: Observations, (num_worlds, m).
-            memory: That of the last decision; None at the first.
-            fresh: Worlds that decide for the first time in their episode.
+            memory: Memory of the last decision; None at the first.
+            is_first: Worlds that decide for the first time in their episode.
             state: State of the corrected policy.
             episode_start: Worlds whose episode begins, for the policy.
 
         Returns:
             (num_worlds, width), and the memory.
         """
-        kept = self.begin(len(rows))
+        last = self.begin(len(rows))
         if memory is None:
-            fresh = np.ones_like(fresh)
+            is_first = np.ones_like(is_first)
         else:
-            kept = put_rows(memory, fresh, select_rows(kept, fresh))
-        memories = kept.sources
-        if any(self._of_base):
+            last = put_rows(memory, is_first, select_rows(last, is_first))
+        memories = last.sources
+        if any(self._reads_base):
             base = self._corrected.base_memory(rows, state, episode_start)
-            pairs = zip(self._of_base, memories, strict=True)
-            memories = [base if is_of_base else own for is_of_base, own in pairs]
+            pairs = zip(self._reads_base, memories, strict=True)
+            memories = [base if reads_base else source for reads_base, source in pairs]
         pairs = zip(self._sources, memories, strict=True)
-        observed = [source.observe(rows, own) for source, own in pairs]
-        values = [values for values, _ in observed]
-        seen = np.hstack([np.zeros((len(rows), 0)), *values])
-        measured = seen[:, self._measured]
-        repeated = np.tile(measured, (1, self._history))
-        past = np.where(fresh[:, None], repeated, kept.past)
-        parts = [seen]
-        if self._acts:
+        observed = [source.observe(rows, memory) for source, memory in pairs]
+        present = np.hstack([np.zeros((len(rows), 0)), *(values for values, _ in observed)])
+        measured = present[:, self._measured]
+        past = np.where(is_first[:, None], np.tile(measured, (1, self._history)), last.past)
+        parts = [present]
+        if self._has_action:
             action = self._corrected.base_action(rows, state, episode_start)
             parts.append(action.astype(np.float64))
         features = np.hstack([*parts, past])
         if self.mirror is not None:
             features = self.mirror(rows, features)
-        remembered = np.hstack([measured, past])[:, : past.shape[1]]
-        return features, FeaturesMemory(remembered, tuple(own for _, own in observed))
+        next_past = np.hstack([measured, past])[:, : past.shape[1]]
+        return features, FeaturesMemory(next_past, tuple(memory for _, memory in observed))
 
     def turn_back(self, rows: Array, residual: Array) -> Array:
-        """Residual as it acts, of one that was decided in the mirror, (num_worlds, k).
-
-        Itself without one.
+        """Residual as it acts, turned back where it was decided in the mirror, (num_worlds, k).
 
         Args:
             rows: Observations of the decision.
-            residual: What was decided by their features.
+            residual: Decision by their features.
         """
-        if self.mirror is None:
-            return residual
-        return self.mirror.turn_back(rows, residual)
+        return residual if self.mirror is None else self.mirror.turn_back(rows, residual)
 
 
 def _groups(model: RobotModel) -> list[str]:
     """Groups of a robot's observation, in order."""
-    names = model.observation_table.names
-    return list(dict.fromkeys(name.split(".")[0] for name in names))
+    return list(dict.fromkeys(name.split(".")[0] for name in model.observation_table.names))
 
 
 def _source_names(observe: tuple[str, ...], model: RobotModel) -> list[str]:
@@ -179,8 +166,7 @@ def _source_names(observe: tuple[str, ...], model: RobotModel) -> list[str]:
     names: list[str] = []
     for name in observe:
         names += _groups(model) if name == OBSERVATION else [name]
-    twice = sorted({name for name in names if names.count(name) > 1})
-    if twice:
+    if twice := sorted({name for name in names if names.count(name) > 1}):
         raise ConfigurationError(
             f"observe must name everything once, {', '.join(twice)} are there twice"
         )
@@ -188,7 +174,7 @@ def _source_names(observe: tuple[str, ...], model: RobotModel) -> list[str]:
 
 
 def _source(name: str, corrected: Corrected, period_s: float) -> Any:
-    """A source of features.
+    """Make a source of features.
 
     It has `signals`, `begin(num_worlds)` makes its memory, and `observe(rows, memory)` returns
     features and the new memory.
@@ -202,13 +188,13 @@ def _source(name: str, corrected: Corrected, period_s: float) -> Any:
     if name in groups or name in table.names:
         columns = table.group(name)
         return _Instant(table.signals[columns], lambda rows: rows[:, columns])
-    further = [error for error, pair in _ERRORS.items() if set(pair) <= set(groups)]
-    if name in further:
-        whole, less = (table.group(group) for group in _ERRORS[name])
+    others = [error for error, pair in _DIFFERENCES.items() if set(pair) <= set(groups)]
+    if name in others:
+        minuend, subtrahend = (table.group(group) for group in _DIFFERENCES[name])
         signals = rename_group(table.signals_of("encoder_angle"), name)
-        return _Instant(signals, lambda rows: rows[:, whole] - rows[:, less])
+        return _Instant(signals, lambda rows: rows[:, minuend] - rows[:, subtrahend])
     if isinstance(model, WalkerModel):
-        made: dict[str, Callable[[], Any]] = {
+        walker_sources: dict[str, Callable[[], Any]] = {
             "contact_error": lambda: _ContactError(model, period_s),
             "level": lambda: GroundLevel(model, period_s),
             "bending": lambda: BendingObserver(model),
@@ -216,15 +202,15 @@ def _source(name: str, corrected: Corrected, period_s: float) -> Any:
             "zmp_error": lambda: _zmp_error(model),
             "zmp_of_steps": lambda: _ZmpOfSteps(model),
         }
-        if name in made:
-            return made[name]()
-        further += [*made, *corrected.base.estimates]
-    known = [OBSERVATION, BASE_ACTION, *further, *groups]
-    raise unknown_name("feature of a residual", name, known)
+        if name in walker_sources:
+            return walker_sources[name]()
+        others += [*walker_sources, *corrected.base.estimates]
+    names = [OBSERVATION, BASE_ACTION, *others, *groups]
+    raise unknown_name("feature of a residual", name, names)
 
 
 class _Instant:
-    """A source that remembers nothing: values of observations, or of the base's memory too."""
+    """A source without memory: values of observations, or of the base's memory too."""
 
     def __init__(
         self, signals: Any, function: Callable[..., Array], reads_base: bool = False
@@ -256,7 +242,7 @@ class _StepMemory(NamedTuple):
         total: Sum of the errors in this step, (num_worlds, 2) [m].
         number: Measurements in it, (num_worlds,).
         support: Support foot of this step, (num_worlds,).
-        means: Of the last steps on both feet, (num_worlds, 2, 2) [m].
+        means: Means of the last steps on both feet, (num_worlds, 2, 2) [m].
     """
 
     total: Array
@@ -268,7 +254,7 @@ class _StepMemory(NamedTuple):
 class _ZmpOfSteps:
     """Mean error of the ZMP in the last step on the left foot, and on the right; zero before it.
 
-    What alternates with the steps, a slow integral of the error does not see.
+    It shows errors that alternate with the steps, which a slow integral does not.
     """
 
     def __init__(self, model: WalkerModel) -> None:
@@ -292,14 +278,14 @@ class _ZmpOfSteps:
         feet = np.arange(2) == memory.support[:, None]
         ended = (is_new[:, None] & feet)[:, :, None]
         means = np.where(ended, mean[:, None], memory.means)
-        walks = rows[:, self._time] > STAND_S
-        total = np.where(is_new[:, None], 0.0, memory.total) + walks[:, None] * error
-        number = np.where(is_new, 0.0, memory.number) + walks
+        is_walking = rows[:, self._time] > STAND_S
+        total = np.where(is_new[:, None], 0.0, memory.total) + is_walking[:, None] * error
+        number = np.where(is_new, 0.0, memory.number) + is_walking
         return means.reshape(len(rows), 4), _StepMemory(total, number, support, means)
 
 
 def _phase(model: WalkerModel) -> _Instant:
-    """Harmonics of the phase of a step, which runs on before and after the walk."""
+    """Harmonics of the phase of a step, also before and after the walk."""
     plan = model.plan
     psi = stride_angle(plan.timing, plan.gait.step_period_s)
     table = harmonics(psi, _PHASE_HARMONICS, is_odd=False)
@@ -315,9 +301,9 @@ def _phase(model: WalkerModel) -> _Instant:
 
 
 _PHASE_HARMONICS = 8
-"""As many as decisions every 0.1 s resolve in a step of 1.6 s."""
+"""Number of harmonics; decisions every 0.1 s resolve as many in a step of 1.6 s."""
 
-_ERRORS = {
+_DIFFERENCES = {
     "encoder_error": ("encoder_angle", "reference_angle"),
     "link_error": ("reference_angle", "link_encoder"),
 }
@@ -327,8 +313,8 @@ _ERRORS = {
 class _ContactError:
     """ZMP [m] and load share by the foot wrenches of flat feet, less the planned ones.
 
-    The wrenches are turned to level ground: there the plan was made. Zero where the feet carry too
-    little for a ZMP.
+    The wrenches are corrected to level ground, for which the plan was made. Values are zero where
+    the feet carry too little for a ZMP.
     """
 
     signals = (

@@ -1,4 +1,4 @@
-"""How a residual acts and what it sees, and the content of `residual.json`."""
+"""Settings of a residual, and the content of `residual.json`."""
 
 from typing import Annotated, Any, Literal
 
@@ -12,25 +12,25 @@ Bound = float | dict[str, float]
 """Value at a residual of 1: for all columns of an input, or by joint or axis."""
 
 RESIDUAL = "residual:"
-"""Before the folder of a trained residual, where policies are named."""
+"""Prefix of the folder of a trained residual, in names of policies."""
 
 TRUE_QUANTITIES = ("stiffness", "load", "slope", "backlash", "friction", "mounting")
-"""What a teacher or a critic can see of the true robot."""
+"""Quantities of the true robot that a teacher or a critic can see."""
 
 _Titles = Annotated[tuple[Title, ...], Field(min_length=1, max_length=MOST_ENTRIES)]
 _Seed = Annotated[int, Field(ge=0, lt=2**32)]
 
 
 class ResidualSettings(Model):
-    """How a residual acts and what it sees."""
+    """Settings of a residual: its inputs, decisions and features."""
 
     acts_on: dict[Title, Bound | None] = Field(
         default={DEFLECTION: None}, min_length=1, max_length=MOST_ENTRIES
     )
     """Inputs of the base that it acts on (`baselines.compensation.inputs`), and the value of each
-    at a residual of 1. That is a number for all columns, or a mapping by the end of the joints'
-    names or by axis, as in {deflection: {ankle_roll: 0.6}, zmp: {x: 0.02}}, which leaves the others
-    alone. None takes the input's default."""
+    at a residual of 1. This is a number for all columns, or a mapping by the end of the joints'
+    names or by axis, as in {deflection: {ankle_roll: 0.6}, zmp: {x: 0.02}}: then it does not act on
+    other columns. None takes the input's default."""
     decision_period: int = quantity("1", 25, ge=1, le=100_000)
     """Control steps between decisions [1]."""
     cutoff_hz: float = quantity("Hz", 2.0, gt=0, le=1e6)
@@ -39,29 +39,28 @@ class ResidualSettings(Model):
     """Joints in which it acts, where an input has one column per joint, by the end of their names
     (ankle_roll means both); None for all."""
     shared: bool = False
-    """Left and right joints of the same name share their residual: there are half as many to
-    explore, and one that follows the step still tells the legs apart by which of them carries the
-    robot."""
+    """True for one residual per pair of left and right joints of the same name: there are half as
+    many to explore. A residual that follows the steps can still act on one leg at a time."""
     mirror: bool = False
-    """It sees a step on the right foot in the mirror, as a step on the left, and what it decides is
-    turned back (`baselines.residual.mirror`). For a walker."""
+    """True to show it steps on the right foot in the mirror, as steps on the left, and to turn its
+    decision back (`baselines.residual.mirror`). For a walker."""
     observe: _Titles = ("observation",)
     """Features that it sees: groups of the observation such as (clock, load_share), or all of it,
-    and what `baselines.residual.features` makes of it and of the plan."""
+    and the features in `baselines.residual.features`."""
     history: int = quantity("1", 0, ge=0, le=1000)
-    """Earlier decisions whose measurements it sees as well [1]."""
+    """Number of earlier decisions whose measurements it sees as well [1]."""
     privileged: tuple[Title, ...] = Field(default=(), max_length=MOST_ENTRIES)
-    """What a teacher sees of the true robot (`baselines.residual.true_robot`); none for a residual
-    that a robot can play. For a walker in simulation."""
+    """Quantities of the true robot that a teacher sees (`baselines.residual.true_robot`); empty for
+    a residual that a robot can play. For a walker in simulation."""
 
     def _check(self) -> None:
         require_known("input", self.acts_on, INPUTS)
         require_known("quantity that a teacher sees", self.privileged, TRUE_QUANTITIES)
         for name, bound in self.acts_on.items():
             kind = INPUTS[name]
-            whole = kind.default if bound is None else bound
-            given = list(whole.values()) if isinstance(whole, dict) else [whole]
-            if not given or not all(0.0 < one < kind.limit for one in given):
+            values = kind.default if bound is None else bound
+            values = list(values.values()) if isinstance(values, dict) else [values]
+            if not values or not all(0.0 < value < kind.limit for value in values):
                 limit = f"{kind.limit:g} {kind.unit}".removesuffix(" 1")
                 raise ValueError(
                     f"the bound of {name} must be positive and below {limit}, got {quote(bound)}"
@@ -69,9 +68,9 @@ class ResidualSettings(Model):
 
     @property
     def bounds(self) -> dict[str, Bound]:
-        """`acts_on` with the defaults put in."""
-        given = self.acts_on.items()
-        return {k: INPUTS[k].default if bound is None else bound for k, bound in given}
+        """`acts_on` with its defaults."""
+        items = self.acts_on.items()
+        return {k: INPUTS[k].default if bound is None else bound for k, bound in items}
 
 
 class TrainedOn(Model):
@@ -95,11 +94,11 @@ class Origin(Model):
 
 
 def require_plain_base(name: str) -> str:
-    """The name of a base policy.
+    """Check the name of a base policy, and return it.
 
     Raises:
-        ValueError: It is itself a residual, which could name another, or itself; or it is code,
-            which a folder from elsewhere must not run.
+        ValueError: The base is itself a residual, which could name another, or itself; or it is
+            code, which a folder from elsewhere must not run.
     """
     if name.startswith(RESIDUAL):
         raise ValueError(f"a base must be no residual itself, got {name!r}; name a baseline")
@@ -112,34 +111,34 @@ def require_plain_base(name: str) -> str:
 
 
 def _require_origin(training: dict[str, Any]) -> dict[str, Any]:
-    """What says how a residual was trained, if comparisons can read it."""
+    """Check that comparisons can read how a residual was trained."""
     Origin(**training)
     return training
 
 
 class ResidualDescription(Model):
-    """Content of `residual.json`, about the weights beside it."""
+    """Content of `residual.json`, which describes the weights in the same folder."""
 
     robot: Title
     """Task of the environment, walker or testbed."""
     joints: list[Title] = Field(default=[], max_length=MOST_ENTRIES)
-    """Joints of the robot that it was trained on; none in folders from before they were written."""
+    """Joints of the robot that it was trained on; none in folders of older versions."""
     base: Annotated[Title, AfterValidator(require_plain_base)]
     """Name of the base policy."""
     base_options: dict[str, Any] = {}
     settings: ResidualSettings = ResidualSettings()
     activation: Literal["tanh", "relu"] = "tanh"
-    """Between the layers."""
+    """Function between the layers."""
     output: Literal["clip", "tanh"] = "clip"
-    """How the last layer comes to [−1, 1]: clipped (PPO), or by tanh (SAC)."""
+    """Function of the last layer to [−1, 1]: clip (PPO), or tanh (SAC)."""
     clip: float = quantity("1", 10.0, gt=0, le=1e6)
     """Bound of normalised features, in standard deviations [1]."""
     weights_sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")] | None = None
-    """Digest of the weights; None for those of folders from before it was written."""
+    """Digest of the weights; None in folders of older versions."""
     training: Annotated[dict[str, Any], AfterValidator(_require_origin)] = {}
-    """How it was trained: configuration, seed, versions, commit."""
+    """Training: configuration, seed, versions, commit."""
 
     @property
     def origin(self) -> Origin:
-        """How it was trained, as far as comparisons read it."""
+        """Part of `training` that comparisons read."""
         return Origin(**self.training)

@@ -1,24 +1,24 @@
-r"""Disturbance observer of a walker: what keeps its divergent component of motion from the plan.
+r"""Disturbance observer of a walker, for what keeps its DCM from the plan.
 
-The model is the linear inverted pendulum with a plan. Its divergent component of motion :math:`\xi
-= c + \dot c / \omega`, with the center of mass c and the ZMP p, obeys [Takenaka2009]
+The model is the linear inverted pendulum with a plan. Its divergent component of motion (DCM)
+:math:`\xi = c + \dot c / \omega`, with the center of mass c and the ZMP p, obeys [Takenaka2009]
 
 .. math:: \dot \xi = \omega (\xi - p), \qquad \xi = \xi_{ref} + u + d
 
 Without a disturbance ξ is that of the plan, whose ZMP is shifted by u (input `zmp` of the policy
-inside); under a shift that stays, the controller's center of mass follows so that ξ moves by u. The
-disturbance d is a load in a place that nobody knows, a slope, or homing errors: by how much the
-robot is ahead of its plan. The ZMP is measured, and the rate of ξ follows from joint angles and
-IMU. Their mean does not: homing errors and the offset of the IMU move it by more than loads do. All
-signals pass one first-order filter, and a second one says what is not noise, as in the observer of
-a joint [Ohnishi1996]:
+inside). Under a constant shift the controller's center of mass follows so that ξ moves by u. The
+disturbance d is how far the robot is ahead of its plan: by a load at an unknown place, a slope, or
+homing errors. The ZMP is measured, and the rate of ξ follows from joint angles and IMU. The mean of
+ξ is not used: homing errors and the offset of the IMU move it by more than loads do. All signals
+pass one first-order filter, and the estimate passes a second one, as in the observer of a joint
+[Ohnishi1996]:
 
 .. math:: \dot{\hat d} = \frac{1}{T} \big( (p - p_{ref}) + (\dot \xi - \dot \xi_{ref}) / \omega
           - u - \hat d \big), \qquad u = -\hat d
 
-u takes d̂ off within bounds. Where the robot answers as the model says, d̂ does not see u, and there
-is no loop: T can be much shorter than for an integral of p − p_ref. Real legs
-answer slow shifts so. They sway under those of a second, which the filters keep off.
+u cancels d̂ within bounds. Where the robot responds like the model, u does not change d̂, and there
+is no loop: T can be much shorter than for an integral of p − p_ref. Real legs respond so to slow
+shifts. They sway under shifts within a second, which the filters suppress.
 
 [Takenaka2009] T. Takenaka et al., "Real Time Motion Generation and Control for Biped Robot", IROS.
 [Ohnishi1996] see `baselines.adaptation.disturbance_observer`.
@@ -29,50 +29,50 @@ from typing import Any
 import numpy as np
 from typing_extensions import override
 
+from baselines.compensation.observation_view import WalkView
 from baselines.compensation.policy import (
     MemoryAround,
     PolicyAround,
     PolicyInputs,
     Step,
-    WalkView,
     filter_share,
-    record_row,
-    record_rows,
 )
-from baselines.walking.mean_zmp import LEAST_LOAD, FlatFeet
+from baselines.compensation.records import record_row, record_rows
+from baselines.compensation.startup import feedback_ramp
+from baselines.walking.flat_feet import LEAST_LOAD, FlatFeet
 from elastic_env.core.compiled import compiled, record_type
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array
-from elastic_env.motion.trajectory import STAND_S, minimum_jerk
+from elastic_env.motion.trajectory import STAND_S
 from elastic_env.world.robot_model import WalkerModel
 
 
 class DcmObserverGains(Model):
-    """How fast a disturbance of a walker is observed, and how much of it is met."""
+    """Time constants and bound of the disturbance observer of a walker."""
 
     time_constant_s: float = quantity("s", 6.0, gt=0)
     """T, with which the estimate follows [s]."""
     filter_s: float = quantity("s", 0.3, gt=0)
     """Time constant of the filter that all signals pass [s]."""
     limit_m: float = quantity("m", 0.03, gt=0, lt=0.05)
-    """Largest disturbance that is met, forward and sideways [m]."""
+    """Largest disturbance that is compensated, forward and sideways [m]."""
 
 
 OBSERVED = record_type(
     steps=(),
-    com=(2,),  # less that of the plan, behind the filter of all signals [m]
-    dcm=(2,),  # likewise
-    zmp=(2,),  # likewise, and less the shift
+    com=(2,),  # less that of the plan, filtered [m]
+    dcm=(2,),  # the same of the DCM [m]
+    zmp=(2,),  # the same of the ZMP, less its shift [m]
     disturbance=(2,),  # d̂ [m]
 )
 """Memory of the observer."""
 
 
 class DcmObserver(PolicyAround):
-    """A policy of a walker whose observed disturbance is met, see the module.
+    """A policy of a walker with its observed disturbance compensated, see the module.
 
     Args:
-        policy: What commands the robot; it has the input `zmp`, and says where the links are.
+        policy: Commands the robot; it has the input `zmp`, and estimates the link angles.
         model: Assumed walker.
         gains: Filters and bound.
         ramp_s: Time in which the shift grows from zero [s].
@@ -100,85 +100,85 @@ class DcmObserver(PolicyAround):
         )
         local = model.plan.local
         self._plan = record_rows(com=local.com, soles=local.ankles[..., :2])
-        steps = max(round(ramp_s / period_s), 1)
-        self._ramp = minimum_jerk(np.arange(steps + 1) / steps)
+        self._ramp = feedback_ramp(ramp_s, period_s)
 
     @override
     def act(self, rows: Array, memory: MemoryAround, inputs: PolicyInputs) -> Step:
-        """Its shift, by what was seen up to the last control step, adds to the input `zmp`."""
-        now = memory.own.copy()
+        """Add the shift by the measurements up to the last control step to the input `zmp`."""
+        estimate = memory.own.copy()
         shift = np.empty((len(rows), 2))
-        meet_disturbance(self._constants, self._ramp, now, shift)
+        cancel_disturbance(self._constants, self._ramp, estimate, shift)
         zmp = shift if inputs.zmp is None else inputs.zmp + shift
         action, inner = self.policy.act(rows, memory.inner, inputs._replace(zmp=zmp))
         links = self.policy.link_angles(rows, inner)
-        seen = self._chains.com_and_feet(links, self._sole, rows[:, self._attitude])
+        com_and_soles = self._chains.com_and_feet(links, self._sole, rows[:, self._attitude])
         error = np.nan_to_num(self._feet.zmp_error(rows), nan=0.0) - shift
-        observe(self._constants, self._walk_view.fields(rows), self._plan, *seen, error, now)
-        return action, MemoryAround(now, inner)
+        observations = self._walk_view.fields(rows)
+        observe(self._constants, observations, self._plan, *com_and_soles, error, estimate)
+        return action, MemoryAround(estimate, inner)
 
 
 @compiled
-def meet_disturbance(constants: Any, ramp: Array, memory: Any, shift: Array) -> None:
-    """Shift of the planned ZMP against the disturbance.
+def cancel_disturbance(constants: Any, ramp: Array, memory: Any, shift: Array) -> None:
+    """Fill in the shift of the planned ZMP against the disturbance.
 
     Args:
         constants: Assumptions and gains, a row, (1,).
-        ramp: Share of it after 0, 1, ... control steps, up to the last one [1].
+        ramp: Share of the shift after 0, 1, ... control steps, up to the last one [1].
         memory: Rows of `OBSERVED`, (n,).
         shift: To be filled, (n, 2) [m].
     """
     limit = constants[0].limit_m
     for world in range(len(memory)):
-        own = memory[world]
-        share = ramp[int(min(own.steps, len(ramp) - 1.0))]
+        estimate = memory[world]
+        share = ramp[int(min(estimate.steps, len(ramp) - 1.0))]
         for i in range(2):
-            shift[world, i] = -share * min(max(own.disturbance[i], -limit), limit)
+            shift[world, i] = -share * min(max(estimate.disturbance[i], -limit), limit)
 
 
 @compiled
 def observe(
     constants: Any,
-    observed: Any,
+    observations: Any,
     plan: Any,
     com: Array,
     soles: Array,
     zmp_error: Array,
     memory: Any,
 ) -> None:
-    """Bring the estimate of the disturbance up to date.
+    """Update the estimate of the disturbance.
 
     Args:
         constants: Assumptions and gains, a row, (1,).
-        observed: Observations, rows with fields, (n,).
+        observations: Rows with fields, (n,).
         plan: Center of mass and soles in the plan's local frame [m], one row per control step.
         com: Center of mass in a level frame, (n, 3) [m].
         soles: Middles of the soles in the same, (n, 2, 3) [m].
         zmp_error: Measured ZMP less the planned one and the shift, (n, 2) [m].
-        memory: Rows of `OBSERVED`, brought up to date, (n,).
+        memory: Rows of `OBSERVED`, to be updated, (n,).
     """
-    own = constants[0]
+    known = constants[0]
     for world in range(len(memory)):
-        now = memory[world]
-        shown = observed[world]
-        right = shown.load_share
-        periods = np.rint(shown.clock[0] / own.period_s)
+        estimate = memory[world]
+        obs = observations[world]
+        right = obs.load_share
+        periods = np.rint(obs.clock[0] / known.period_s)
         row = int(min(max(periods - 1.0, 0.0), len(plan) - 1.0))
         planned = plan[row]
         for i in range(2):
             on_left = com[world, i] - soles[world, 0, i] + planned.soles[0, i]
             on_right = com[world, i] - soles[world, 1, i] + planned.soles[1, i]
             ahead = (1.0 - right) * on_left + right * on_right - planned.com[i]
-            if now.steps == 0.0:
-                now.com[i] = ahead
-                now.dcm[i] = ahead
-                now.zmp[i] = zmp_error[world, i]
-            moved = own.smooth_share * (ahead - now.com[i])
-            now.com[i] += moved
-            now.zmp[i] += own.smooth_share * (zmp_error[world, i] - now.zmp[i])
-            dcm = now.com[i] + moved / (own.period_s * own.omega)
-            rate = (dcm - now.dcm[i]) / own.period_s
-            now.dcm[i] = dcm
-            missing = now.zmp[i] + rate / own.omega - now.disturbance[i]
-            now.disturbance[i] += own.follow_share * missing
-        now.steps += 1.0
+            if estimate.steps == 0.0:
+                estimate.com[i] = ahead
+                estimate.dcm[i] = ahead
+                estimate.zmp[i] = zmp_error[world, i]
+            step = known.smooth_share * (ahead - estimate.com[i])
+            estimate.com[i] += step
+            estimate.zmp[i] += known.smooth_share * (zmp_error[world, i] - estimate.zmp[i])
+            dcm = estimate.com[i] + step / (known.period_s * known.omega)
+            rate = (dcm - estimate.dcm[i]) / known.period_s
+            estimate.dcm[i] = dcm
+            missing = estimate.zmp[i] + rate / known.omega - estimate.disturbance[i]
+            estimate.disturbance[i] += known.follow_share * missing
+        estimate.steps += 1.0

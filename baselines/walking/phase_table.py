@@ -1,16 +1,16 @@
-r"""Phase table: what robots have in common is fed forward, over the phase of a step.
+r"""Phase table: a feedforward over the phase of a step, the same for all robots.
 
-The cheap rival of learning. A table says by how much the planned ZMP is shifted and the hips are
-turned, and knows nothing of the robot at hand. It has a few harmonics of the walk, of stride angle
-ψ: from 0 to π in a step that swings the right foot, from π to 2π in one that swings the left foot.
+It is a simple alternative to learning. A table has the shift of the planned ZMP and the turn of the
+hips. It does not depend on the robot at hand. It holds a few harmonics of the stride angle ψ, which
+runs from 0 to π in a step that swings the right foot, and from π to 2π in the next one.
 
 .. math::
     u_{x}(\psi) = \sum_k a_k \cos 2 k \psi + b_k \sin 2 k \psi, \qquad
     u_{y}(\psi) = \sum_k a_k \cos (2 k - 1) \psi + b_k \sin (2 k - 1) \psi
 
-Forward shift and pitch are alike in left and right steps and have even harmonics; shift to the left
-and roll have odd ones, as the mirror turns their sign. There is no constant: what stays all the
-time is the matter of integrals. `train.learn.phase_table` finds the numbers in simulation.
+Forward shift and pitch are the same in left and right steps and have even harmonics. Shift to the
+left and roll have odd ones, as the mirror changes their sign. There is no constant: integrals
+remove constant errors. `train.learn.phase_table` finds the numbers in simulation.
 """
 
 from pathlib import Path
@@ -29,7 +29,7 @@ from elastic_env.motion.trajectory import minimum_jerk
 from elastic_env.world.robot_model import WalkerModel
 
 MOST_HARMONICS = 8
-"""Of each column of a table."""
+"""Largest number of harmonics in a column of a table."""
 CHANNELS = ("zmp_x", "zmp_y", "hip_roll", "hip_pitch")
 """Columns of a table: shift of the planned ZMP [m], turn of both hips [rad]."""
 _IS_ODD = (False, True, True, False)
@@ -46,7 +46,7 @@ class PhaseTable(Model):
     step_period_s: float = quantity("s", gt=0)
     """Duration of a step [s]."""
     found_on: Title
-    """Policy and robots that it was found with."""
+    """Policy and robots for which it was optimised."""
     zmp_x: _Harmonics
     """Shift of the planned ZMP forward [m]."""
     zmp_y: _Harmonics
@@ -82,14 +82,11 @@ def harmonics(psi: Array, count: int, is_odd: bool) -> Array:
 
 
 def stride_angle(timing: Timing, step_period_s: float) -> Array:
-    """Stride angle ψ at the ends of the control periods, (T,) [rad].
-
-    It runs on before and after the walk.
-    """
+    """Stride angle ψ at the ends of all control periods, within the walk or not, (T,) [rad]."""
     begin = int(np.flatnonzero(timing.walking)[0])
-    since = timing.time - timing.time[begin - 1]
+    elapsed = timing.time - timing.time[begin - 1]
     first = 0.0 if timing.support[begin] == LEFT else np.pi
-    return first + np.pi * since / step_period_s
+    return first + np.pi * elapsed / step_period_s
 
 
 def shipped_tables() -> dict[float, Path]:
@@ -99,7 +96,7 @@ def shipped_tables() -> dict[float, Path]:
 
 
 def load_phase_table(step_period_s: float, file: Path | None = None) -> PhaseTable:
-    """A table for a gait, from a file or of the package.
+    """Read the table for a gait, from a file or from the package.
 
     Raises:
         ConfigurationError: There is none for this step period, or it is not valid.
@@ -108,8 +105,8 @@ def load_phase_table(step_period_s: float, file: Path | None = None) -> PhaseTab
     if file is None:
         file = shipped.get(round(step_period_s, 3))
     if file is None:
-        known = ", ".join(f"{period:g}" for period in sorted(shipped))
-        has = f"those for step periods of {known} s" if known else "none"
+        periods = ", ".join(f"{period:g}" for period in sorted(shipped))
+        has = f"those for step periods of {periods} s" if periods else "none"
         raise ConfigurationError(
             f"phase_table needs a table for the step period of the gait, {step_period_s:g} s; the"
             f" package has {has}; find one by `python -m train.learn.phase_table` and name its file"
@@ -131,10 +128,10 @@ def load_phase_table(step_period_s: float, file: Path | None = None) -> PhaseTab
 class PhaseFeedforward(PassingMemory):
     """A policy of a walker with a table added to its inputs `zmp` and `hip`, see the module.
 
-    The table comes with the first double support and goes with the last one.
+    The table fades in with the first double support, and out with the last one.
 
     Args:
-        policy: What commands the robot; it has the inputs `zmp` and `hip`.
+        policy: Commands the robot; it has the inputs `zmp` and `hip`.
         model: Assumed walker.
         table: For its step period.
     """
@@ -145,17 +142,15 @@ class PhaseFeedforward(PassingMemory):
         gait = plan.gait
         timing = plan.timing
         begin, *_, end = timing.time[timing.walking]
-        coming = (timing.time - begin) / gait.double_support_s
-        going = (end - timing.time) / gait.last_double_support_s
-        share = minimum_jerk(np.clip(np.minimum(coming, going), 0.0, 1.0))
-        values = table.values(stride_angle(timing, gait.step_period_s))
-        self._inputs = share[:, None] * values
+        fade_in = (timing.time - begin) / gait.double_support_s
+        fade_out = (end - timing.time) / gait.last_double_support_s
+        share = minimum_jerk(np.clip(np.minimum(fade_in, fade_out), 0.0, 1.0))
+        self._inputs = share[:, None] * table.values(stride_angle(timing, gait.step_period_s))
 
     @override
     def act(self, rows: Array, memory: Any, inputs: PolicyInputs) -> Step:
-        """It adds to the inputs `zmp` and `hip`; its memory is that of the policy inside."""
-        row = self.view.plan_row(rows)
-        ahead = self._inputs.take(row, axis=0, mode="clip")
-        zmp = ahead[:, :2] if inputs.zmp is None else inputs.zmp + ahead[:, :2]
-        hip = ahead[:, 2:] if inputs.hip is None else inputs.hip + ahead[:, 2:]
+        """Add the table to the inputs `zmp` and `hip`."""
+        table = self._inputs.take(self.view.plan_row(rows), axis=0, mode="clip")
+        zmp = table[:, :2] if inputs.zmp is None else inputs.zmp + table[:, :2]
+        hip = table[:, 2:] if inputs.hip is None else inputs.hip + table[:, 2:]
         return self.policy.act(rows, memory, inputs._replace(zmp=zmp, hip=hip))

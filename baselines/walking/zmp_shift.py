@@ -1,20 +1,20 @@
-r"""A shift of the ZMP as offsets of the joints: the pelvis moves as an inverted pendulum has to.
+r"""Offsets of the joints for a shift of the ZMP: the pelvis moves like an inverted pendulum.
 
 The ZMP p of a pendulum whose center of mass moves by c is [Kajita2003]
 
 .. math:: p = c - \ddot c / \omega^2
 
-A shift that is known over the whole walk has one c that stays bounded. Its Fourier transform is
-that of p over 1 + (ν/ω)²: a low-pass filter without phase shift, which looks as far ahead as back.
-The pelvis is moved by c over feet that stay, by inverse kinematics. A learned p makes a plan of its
-own of the ZMP, as in [Hu2015].
+A shift that is known over the whole walk has exactly one bounded c. Its Fourier transform is the
+one of p over 1 + (ν/ω)²: a low-pass filter without phase shift, which uses future values as far as
+past ones. Inverse kinematics move the pelvis by c over feet that stay. A learned p makes a new plan
+of the ZMP, as in [Hu2015].
 
-A shift of which only the present is known is taken to stay as it is. Then the bounded solution is a
+A shift of which only the present value is known counts as constant. Then the bounded solution is a
 first-order lag,
 
 .. math:: \dot c = \omega (p - c)
 
-and while p changes, the ZMP is shifted by p − ṗ/ω: it comes late by 1/ω, and sets out in the other
+and while p changes, the ZMP is shifted by p − ṗ/ω: it is late by 1/ω, and begins in the opposite
 direction.
 
 [Kajita2003] S. Kajita et al., "Biped Walking Pattern Generation by using Preview Control of
@@ -29,19 +29,20 @@ import numpy as np
 from scipy import linalg
 
 from baselines.compensation.contact_torque import cosine_and_sine
-from baselines.compensation.policy import record_row, record_rows
+from baselines.compensation.records import record_row, record_rows
 from elastic_env.core.compiled import compiled, compiled_part
 from elastic_env.core.signals import Array
 from elastic_env.rigid.leg_kinematics import LegGeometry, turn
 from elastic_env.world.robot_model import WalkerModel
 
 _PROBE_M = 0.005
+"""Displacement of the pelvis for finite differences [m]."""
 _REACH = 0.999
-"""Share of the straight leg's length to which a foot may go."""
+"""Largest distance of ankle and hip, over the length of the straight leg [1]."""
 
 
 def center_of_mass_shift(zmp: Array, omega: float, period_s: float) -> Array:
-    """The bounded c of a ZMP shift, at rest before the first and after the last row.
+    """Bounded c of a ZMP shift, at rest before the first and after the last row.
 
     Args:
         zmp: Shift p over time, (T, k) [m].
@@ -58,7 +59,7 @@ def center_of_mass_shift(zmp: Array, omega: float, period_s: float) -> Array:
 
 
 def following_share(omega: float, period_s: float) -> float:
-    """Share of its way that the c of a constant ZMP shift goes in a period [1].
+    """Share of the remaining way that c goes in a period, under a constant ZMP shift [1].
 
     Args:
         omega: Natural frequency of the pendulum [rad/s].
@@ -70,15 +71,15 @@ def following_share(omega: float, period_s: float) -> float:
 def center_of_mass_per_pelvis(model: WalkerModel) -> Array:
     """Motion of the center of mass per motion of the standing pelvis, x and y, (2,) [1].
 
-    The legs follow the pelvis by half on average: it is the share of the weight that the pelvis
-    carries along.
+    It is the share of the weight that the pelvis carries along: the legs follow it by half on
+    average.
     """
     plan = model.plan
     biped = model.biped
     axes = np.eye(3)[:2]
-    moved = plan.pelvis[0] + _PROBE_M * np.concatenate([axes, -axes])
-    q = biped.joint_angles(moved, np.broadcast_to(plan.ankles[0], (4, 2, 3)))
-    com = moved + biped.chains.center_of_mass(q)
+    pelvis = plan.pelvis[0] + _PROBE_M * np.concatenate([axes, -axes])
+    q = biped.joint_angles(pelvis, np.broadcast_to(plan.ankles[0], (4, 2, 3)))
+    com = pelvis + biped.chains.center_of_mass(q)
     return np.diagonal((com[:2] - com[2:])[:, :2] / (2.0 * _PROBE_M)).copy()
 
 
@@ -90,13 +91,13 @@ class Stances(NamedTuple):
 
     @classmethod
     def of(cls, model: WalkerModel) -> "Stances":
-        """Those of the assumed walker and its plan."""
+        """Legs of the assumed walker, and the stances of its plan."""
         leg = model.biped.leg
         local = model.plan.local
         legs = record_row(
             thigh=leg.thigh,  # [m]
             shank=leg.shank,  # [m]
-            reach=_REACH * leg.reach,  # to which ankles come from their hips [m]
+            reach=_REACH * leg.reach,  # largest distance of ankle and hip [m]
             hips=model.biped.hips,  # [m]
         )
         rows = record_rows(
@@ -109,7 +110,7 @@ class Stances(NamedTuple):
 
 
 def within_reach(leg: LegGeometry, ankle: Array) -> Array:
-    """Ankles from their hips, (..., 3) [m], drawn in along the leg to where it reaches."""
+    """Ankles relative to their hips, (..., 3) [m], pulled along the leg to within its reach."""
     distance = np.linalg.norm(ankle, axis=-1, keepdims=True)
     return ankle * np.minimum(1.0, _REACH * leg.reach / distance)
 
@@ -127,16 +128,16 @@ def zmp_shift_offsets(model: WalkerModel, zmp: Array) -> Array:
     stances = Stances.of(model)
     offsets = np.zeros((len(zmp), len(model.joint_names)))
     plan = model.plan
-    in_world = turn(zmp, plan.heading)
-    moved = center_of_mass_shift(in_world, plan.omega, model.control_period_s)
-    shift = turn(moved, -plan.heading)
+    zmp_in_world = turn(zmp, plan.heading)
+    com_in_world = center_of_mass_shift(zmp_in_world, plan.omega, model.control_period_s)
+    shift = turn(com_in_world, -plan.heading)
     move_pelvis(*stances, np.arange(len(zmp)), shift, offsets)
     return offsets
 
 
 @compiled
 def move_pelvis(legs: Any, stances: Any, steps: Any, shift: Array, out: Array) -> None:
-    """Add the offsets that move the planned pelvis over feet that stay; no shift changes no bit.
+    """Add the offsets that move the planned pelvis over feet that stay; zero changes no bit.
 
     Where a foot would be out of reach, the leg is as long as it can be.
 
@@ -144,7 +145,7 @@ def move_pelvis(legs: Any, stances: Any, steps: Any, shift: Array, out: Array) -
         legs: Row of `Stances`, (1,).
         stances: Rows of `Stances`, one per control step of the plan.
         steps: Row of the plan for each of the shifts, (n,).
-        shift: Forward and to the left in the plan's local frame, (n, 2) [m].
+        shift: Shifts forward and to the left in the plan's local frame, (n, 2) [m].
         out: To be added to, (n, 12) [rad].
     """
     leg = legs[0]
@@ -157,20 +158,20 @@ def move_pelvis(legs: Any, stances: Any, steps: Any, shift: Array, out: Array) -
 
 @compiled
 def move_feet(legs: Any, stances: Any, steps: Any, shift: Array, out: Array) -> None:
-    """Add the offsets that move planned feet under a pelvis that stays; as `move_pelvis`.
+    """Add the offsets that move planned feet under a pelvis that stays, as `move_pelvis` does.
 
     Args:
         legs: Row of `Stances`, (1,).
         stances: Rows of `Stances`, one per control step of the plan.
         steps: Row of the plan for each of the shifts, (n,).
-        shift: Of the left and the right foot in the plan's local frame, (n, 2, 2) [m].
+        shift: Shifts of the left and the right foot in the plan's local frame, (n, 2, 2) [m].
         out: To be added to, (n, 12) [rad].
     """
     for row in range(len(shift)):
         for side in range(2):
-            own = shift[row, side]
-            if own[0] != 0.0 or own[1] != 0.0:
-                move_hip(legs[0], stances[steps[row]], side, -own, out[row])
+            of_foot = shift[row, side]
+            if of_foot[0] != 0.0 or of_foot[1] != 0.0:
+                move_hip(legs[0], stances[steps[row]], side, -of_foot, out[row])
 
 
 @compiled_part
@@ -183,10 +184,10 @@ def move_hip(leg: Any, stance: Any, side: int, shift: Array, out: Array) -> None
     z = ankle[2] - stance.pelvis[2] - hip[2]
     cosine = stance.foot_yaw[side, 0]
     sine = stance.foot_yaw[side, 1]
-    # the hip yaw stays that of the plan: in the frame of the sole the leg is level
+    # the hip yaw of the plan stays: in the frame of the sole the leg is level
     x, y = cosine * x + sine * y, cosine * y - sine * x
-    pulled = min(1.0, leg.reach / math.sqrt(x**2 + y**2 + z**2))
-    roll, pitch, knee = level_leg(leg, pulled * x, pulled * y, pulled * z)
+    scale = min(1.0, leg.reach / math.sqrt(x**2 + y**2 + z**2))
+    roll, pitch, knee = level_leg(leg, scale * x, scale * y, scale * z)
     q = (stance.q[side, 0], roll, pitch, knee, -(pitch + knee), -roll)
     for i in range(6):
         out[6 * side + i] += q[i] - stance.q[side, i]
@@ -196,15 +197,14 @@ def move_hip(leg: Any, stance: Any, side: int, shift: Array, out: Array) -> None
 def level_leg(legs: Any, x: float, y: float, z: float) -> tuple[float, float, float]:
     """Hip roll, hip pitch and knee of a leg whose sole is parallel to the pelvis [rad].
 
-    The arguments are the ankle less the hip [m].
-
-    `elastic_env.rigid.leg_kinematics.leg_angles` has soles of every attitude.
+    The arguments are the ankle less the hip [m]. `elastic_env.rigid.leg_kinematics.leg_angles` is
+    for soles of any attitude.
     """
     distance = math.sqrt(x**2 + y**2 + z**2)
     thigh = legs.thigh
     shank = legs.shank
     cosine = (distance**2 - thigh**2 - shank**2) / (2.0 * thigh * shank)
     knee = math.acos(min(max(cosine, -1.0), 1.0))
-    # from the line of hip and ankle
-    of_shank = math.atan2(thigh * math.sin(knee), shank + thigh * math.cos(knee))
-    return math.atan2(y, -z), of_shank + math.atan2(-x, math.hypot(y, z)) - knee, knee
+    # angle of the shank against the line of hip and ankle
+    shank_angle = math.atan2(thigh * math.sin(knee), shank + thigh * math.cos(knee))
+    return math.atan2(y, -z), shank_angle + math.atan2(-x, math.hypot(y, z)) - knee, knee

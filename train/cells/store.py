@@ -24,7 +24,7 @@ import numpy.typing as npt
 from baselines.adaptation import offset_folder
 from baselines.identification.identify import StaticPoints
 from baselines.policies import is_saved
-from baselines.residual.residual_policy import DESCRIPTION, WEIGHTS, find_folder
+from baselines.residual.residual_folder import DESCRIPTION, WEIGHTS, find_folder
 from elastic_env.core.errors import ElasticError, quote
 from elastic_env.core.files import digest_of, is_file, read_bounded, write_whole
 from train.evaluate.conditions import Condition

@@ -11,15 +11,11 @@ from pydantic import model_validator
 from rich.console import Console
 from rich.table import Table
 
-from baselines.adaptation.iterative import (
-    IterativeLearner,
-    LearningGains,
-    Stage,
-    Trial,
-    learned_signals,
-)
+from baselines.adaptation.iterative import IterativeLearner, Trial, Trials
+from baselines.adaptation.learned_signals import LearningGains, learned_signals
 from baselines.adaptation.offset_folder import TableDescription, motion_of, save_table
-from baselines.catalogue import PolicyOptions, learned_base
+from baselines.catalogue import learned_base
+from baselines.policy_options import PolicyOptions
 from elastic_env.core.config import Model, Title, quantity
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.world.robot_model import WalkerModel
@@ -140,7 +136,7 @@ class Iterate(Model):
 
             policy.rehearse(env, self.seed, keep)
             signals = learned_signals(env.unwrapped.assumed_model, self.gains)
-            keep(Stage(env, self.seed).trial(policy, signals, policy.trials))
+            keep(Trials(env, self.seed).play(policy, signals, policy.trials))
         return trials
 
     def _write(self, trials: Sequence[Trial], names: Sequence[str], path: Path) -> Path:

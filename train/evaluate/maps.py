@@ -11,7 +11,8 @@ from typing import Annotated, Any, Self
 
 from pydantic import Field, model_validator
 
-from baselines.catalogue import PolicyOptions, Track
+from baselines.catalogue import Track
+from baselines.policy_options import PolicyOptions
 from elastic_env.core.config import MOST_ENTRIES, Model, Once, Title
 from elastic_env.core.errors import ConfigurationError, choices_listed, quote
 from elastic_env.world.scenario import GROUNDS

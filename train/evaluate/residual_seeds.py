@@ -15,7 +15,7 @@ from typing import Any
 
 from baselines.catalogue import ASSUMED_OPTIONS
 from baselines.policies import RESIDUAL, best_analytic
-from baselines.residual.residual_policy import DESCRIPTION, read_description, shipped_names
+from baselines.residual.residual_folder import DESCRIPTION, read_description, shipped_names
 from baselines.residual.settings import ResidualDescription
 from elastic_env.core.errors import ConfigurationError, quote, shorten
 from train.evaluate.conditions import Member, PolicySpec

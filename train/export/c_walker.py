@@ -13,7 +13,8 @@ import numpy as np
 
 from baselines.adaptation.estimators import ASSUMED_LOADS, LegEstimator
 from baselines.adaptation.online_stiffness import OnlineStiffness
-from baselines.compensation.compensators import Compensated, GravityCompensator
+from baselines.compensation.compensated import Compensated
+from baselines.compensation.compensators import GravityCompensator
 from baselines.compensation.contact_torque import ContactGravity
 from baselines.compensation.policy import NO_INPUTS
 from baselines.estimation.bending import (

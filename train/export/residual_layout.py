@@ -12,7 +12,8 @@ import numpy as np
 import baselines
 import elastic_env
 from baselines.residual.mirror import Mirror
-from baselines.residual.residual_policy import WEIGHTS, Network, Tensors, find_folder, load_residual
+from baselines.residual.network import Network, Tensors
+from baselines.residual.residual_folder import WEIGHTS, find_folder, load_residual
 from baselines.residual.settings import RESIDUAL, ResidualDescription
 from elastic_env.core.errors import ConfigurationError, quote
 from elastic_env.core.signals import Array, BoolArray, IntArray, Signal

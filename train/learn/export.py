@@ -13,7 +13,7 @@ from gymnasium.spaces.utils import flatdim
 from stable_baselines3.common.base_class import BaseAlgorithm
 from torch import nn
 
-from baselines.residual.residual_policy import save_residual
+from baselines.residual.residual_folder import save_residual
 from elastic_env.core.errors import ConfigurationError, ElasticError, quote, shorten, unknown_name
 from train.learn.algorithm_options import CONSTANTS
 from train.learn.train_config import TrainConfig, joints_of, training_worlds

@@ -11,7 +11,7 @@ learning control, with a damped inverse of G as the learning gain [Bristow2006],
 
 .. math:: u \leftarrow u - \gamma (G^* G + \lambda)^{-1} G^* e
 
-[Bristow2006]: see `baselines.adaptation.iterative`.
+[Bristow2006]: see `baselines.adaptation.learning_law`.
 """
 
 from collections.abc import Sequence

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from baselines.residual.residual_policy import save_residual
+from baselines.residual.residual_folder import save_residual
 from baselines.residual.settings import ResidualDescription
 from elastic_env.core.errors import ConfigurationError, ElasticError, shorten
 from elastic_env.core.files import read_bounded, write_whole

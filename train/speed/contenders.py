@@ -16,7 +16,8 @@ from typing_extensions import override
 from baselines.compensation.inputs import COMMAND, DEFLECTION, inputs_of
 from baselines.residual.correction import Corrected
 from baselines.residual.features import Features
-from baselines.residual.residual_policy import Network, ResidualPolicy
+from baselines.residual.network import Network
+from baselines.residual.residual_policy import ResidualPolicy
 from baselines.residual.settings import ResidualDescription, ResidualSettings
 from elastic_env.core.signals import Array
 from train.evaluate.conditions import Condition, PolicySpec
