@@ -18,8 +18,9 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from baselines.identification.geometry_fit import GeometryProblem, fit_geometry
+from baselines.identification.geometry_fit import fit_geometry
 from baselines.identification.geometry_model import Geometry, GeometryModel
+from baselines.identification.geometry_problem import GeometryProblem
 from baselines.identification.geometry_result import correct_model
 from baselines.identification.holdout import RIGID, rival_errors
 from elastic_env.core.config import Model
@@ -212,7 +213,7 @@ def _problem(
     sites = [(f"{side}_hand", model.site(f"{side}_hand")) for side in sides]
     places = [(name, int(site.bodyid[0]), site.pos.copy()) for name, site in sites]
     problem = GeometryProblem(
-        model=GeometryModel.of(_tree(spec, joints), joints, model.opt.gravity, places),
+        model=GeometryModel.from_tree(_tree(spec, joints), joints, model.opt.gravity, places),
         theta=poses.theta[:, columns],
         measured=poses.measured[:, markers],
         joints=joints,

@@ -11,9 +11,10 @@ from baselines.identification.arm_fit import ArmFit
 from baselines.identification.arm_result import ArmIdentification
 from baselines.identification.geometry_result import GeometryIdentification
 from baselines.identification.holdout import HeldOut
-from baselines.identification.identify import Identification, StaticPoints, link_torque
+from baselines.identification.identify import Identification
 from baselines.identification.pose_model import measurement_unit
 from baselines.identification.servo_log import ServoLog
+from baselines.identification.static_points import StaticPoints, link_torque
 from elastic_env.core.signals import Array
 from elastic_env.world.robot_model import RobotModel
 from train.figures.plots import MRAD, label_text, new_figure, save, show_numbers
