@@ -13,7 +13,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rich.console import Console
 
-from baselines.identification.servo_drive import find_limit_per_gain, torque_per_gain
 from baselines.identification.servo_file import AngleUnit
 from baselines.identification.servo_fit import ServoFit, fit_servo
 from baselines.identification.servo_holdout import (
@@ -26,6 +25,7 @@ from baselines.identification.servo_holdout import (
 from baselines.identification.servo_intervals import cluster_variance
 from baselines.identification.servo_load import GRAVITY, Load
 from baselines.identification.servo_log import ServoLog, read_servo_log
+from baselines.identification.servo_problem import find_limit_per_gain
 from baselines.identification.servo_replay import NAMES, Replay
 from baselines.identification.servo_result import ServoIdentification, describe_servo
 from docs.pages.recorded import priors
@@ -538,7 +538,7 @@ def test_the_start_limits_the_torque_where_the_replay_does() -> None:
     _, logs = short_logs(5)
     log = replace(logs[0], supply=12.0)
     duty = 0.4 * log.gain * float(np.abs(log.goal - log.position).max())
-    torque = 1e-3 * torque_per_gain(log, duty)
+    torque = 1e-3 * log.torque_per_gain(duty)
     pull = 1e-3 * log.supply * log.gain * (log.goal - log.position)
     limit = 1e-3 * duty * log.supply
     np.testing.assert_allclose(torque, np.clip(pull, -limit, limit) * log.enabled)

@@ -11,7 +11,11 @@ from baselines.identification.arm_fit import ArmFit, deviations
 from baselines.identification.holdout import HeldOut
 from baselines.identification.pose_log import Kind
 from baselines.identification.pose_model import SMALLEST_LOAD
-from baselines.identification.result_files import save_result, six_digits, stiffness_interval
+from baselines.identification.result_files import (
+    save_result,
+    stiffness_interval,
+    stiffness_line,
+)
 from elastic_env.core.config import Model
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array, BoolArray
@@ -97,17 +101,10 @@ class ArmIdentification(Model):
         """Write `identification.json` and `joints.yaml`."""
         head = "# stiffness [N·m/rad], by elastic identify; .inf for a rigid joint"
         lines = [
-            yaml_line(
-                joint.joint,
-                {"stiffness": six_digits(joint.stiffness_nm_per_rad)},
-                _comment(joint),
-            )
+            stiffness_line(joint.joint, joint.stiffness_nm_per_rad, _comment(joint))
             for joint in self.joints
         ]
-        lines += [
-            yaml_line(name, {"stiffness": math.inf}, "rigid: not sought")
-            for name in self.rigid_joints
-        ]
+        lines += [stiffness_line(name, math.inf, "rigid: not sought") for name in self.rigid_joints]
         lines += [yaml_line(name, "held", "not in the log") for name in self.held_joints]
         return save_result(self, folder, head, lines)
 

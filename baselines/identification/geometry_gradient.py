@@ -38,19 +38,30 @@ def marker_gradient(
     """
     posture = model.posture(parameters, theta, axial)
     places = model.to_tracker(parameters, posture.marker)
-    motion = _SmallMotion(model, parameters, posture, model.loads(parameters, posture, axial))
+    loads = model.loads(parameters, posture, axial)
+    motion = _SmallMotion(model, parameters, posture, loads)
+    frames = _nominal_frames(model, posture)
+    lengths = _turns_about(frames)
+    lengths = lengths._replace(axis=lengths.velocity, velocity=lengths.axis)
+    angles = _turns_about(frames @ left_jacobian(parameters.angle))
     count, k, _ = places.shape
-    by_frame = (count, k, 3, model.num_joints, 3)
+    n = model.num_joints
+    is_own = np.eye(3 * n, dtype=np.bool_)
+    by_compliance = motion.by_turns(np.where(is_own, loads.reshape(count, 1, 3 * n), 0.0))
+    by_friction = np.zeros((count, k, 3, n))
+    if axial is not None:
+        turns = (-parameters.compliance[:, 2] * axial.direction)[:, None]
+        by_friction = motion.by_turns(np.where(is_own[:, 2::3], turns, 0.0))
     return places, GeometryParameters(
         translation=np.broadcast_to(np.eye(3), (count, k, 3, 3)),
         rotation=-cross_matrix(places - model.origin - parameters.translation)
         @ left_jacobian(parameters.rotation),
         marker=motion.by_marker_places(),
-        offset=-motion.by_twists(motion.joint_twists()),
-        length=motion.by_twists(motion.length_twists()).reshape(by_frame),
-        angle=motion.by_twists(motion.angle_twists()).reshape(by_frame),
-        compliance=motion.by_compliance().reshape(by_frame),
-        friction=motion.by_friction(axial),
+        offset=-motion.by_twists(_turns_of_joints(posture)),
+        length=motion.by_twists(lengths).reshape(count, k, 3, n, 3),
+        angle=motion.by_twists(angles).reshape(count, k, 3, n, 3),
+        compliance=by_compliance.reshape(count, k, 3, n, 3),
+        friction=by_friction,
     )
 
 
@@ -86,105 +97,40 @@ class _SmallMotion:
     posture: Posture
     loads: Array
 
-    @property
-    def num_poses(self) -> int:
-        """Number of poses N."""
-        return len(self.loads)
-
-    @property
-    def num_joints(self) -> int:
-        """Number of joints n."""
-        return self.model.num_joints
-
     def by_marker_places(self) -> Array:
         """Derivatives by the places of the markers on their links, (N, k, 3, k, 3)."""
         R = self.model.tracker_rotation(self.parameters)
         k = len(self.model.markers)
-        gradient = np.zeros((self.num_poses, k, 3, k, 3))
+        gradient = np.zeros((len(self.loads), k, 3, k, 3))
         for i, marker in enumerate(self.model.markers):
-            gradient[:, i, :, i] = R @ (
-                np.eye(3) if marker.joint < 0 else self.posture.link[marker.joint]
-            )
+            link = np.eye(3) if marker.joint < 0 else self.posture.link[marker.joint]
+            gradient[:, i, :, i] = R @ link
         return gradient
-
-    def by_compliance(self) -> Array:
-        """Derivatives by the compliances, (N, k, 3, 3 n)."""
-        n = self.num_joints
-        turns = np.zeros((self.num_poses, 3 * n, 3 * n))
-        turns[:, np.arange(3 * n), np.arange(3 * n)] = self.loads.reshape(self.num_poses, 3 * n)
-        return self._by_turns(turns)
-
-    def by_friction(self, axial: AxialTorques | None) -> Array:
-        """Derivatives by the friction of each joint, (N, k, 3, n)."""
-        n = self.num_joints
-        if axial is None:
-            return np.zeros((self.num_poses, len(self.model.markers), 3, n))
-        turns = np.zeros((self.num_poses, 3 * n, n))
-        by_friction = -self.parameters.compliance[:, 2] * axial.direction
-        turns[:, np.arange(2, 3 * n, 3), np.arange(n)] = by_friction
-        return self._by_turns(turns)
 
     def by_twists(self, twists: _Twists) -> Array:
         """Derivatives by twists, (N, k, 3, P)."""
-        return self._by_turns(self._moment_changes(twists), self._marker_velocities(twists))
+        return self.by_turns(self._moment_changes(twists), self._marker_velocities(twists))
 
-    def joint_twists(self) -> _Twists:
-        """Turns of the joints about their own axes, n twists."""
-        n = self.num_joints
-        return _Twists(
-            joint=np.arange(n),
-            axis=np.moveaxis(self.posture.link[..., 2], 0, 1),
-            velocity=np.zeros((self.num_poses, n, 3)),
-            turns_housing=np.zeros(n, dtype=np.bool_),
-        )
-
-    def angle_twists(self) -> _Twists:
-        """Changes of the angles ω of each joint, 3 n twists."""
-        return _turns_about(self._nominal_frames @ left_jacobian(self.parameters.angle))
-
-    def length_twists(self) -> _Twists:
-        """Changes of the lengths v of each joint, 3 n twists."""
-        turns = _turns_about(self._nominal_frames)
-        return turns._replace(axis=turns.velocity, velocity=turns.axis)
-
-    @cached_property
-    def _nominal_frames(self) -> Array:
-        """Axes of the nominal frames behind their parents' links, (N, n, 3, 3)."""
-        parents = [
-            np.broadcast_to(np.eye(3), (self.num_poses, 3, 3))
-            if parent < 0
-            else self.posture.link[parent]
-            for parent in self.model.parent
-        ]
-        return np.stack(parents, axis=1) @ self.model.nominal
-
-    @cached_property
-    def _deflection_twists(self) -> _Twists:
-        """Changes of the deflections φ of each joint, 3 n twists."""
-        housings = np.moveaxis(self.posture.housing, 0, 1)
-        axes = housings @ left_jacobian(self.parameters.compliance * self.loads)
-        return _turns_about(axes, turns_housing=False)
-
-    @cached_property
-    def _deflection_matrix(self) -> Array:
-        """1 − c ∂m/∂φ, (N, 3 n, 3 n)."""
-        return np.eye(3 * self.num_joints) - self._moment_changes(self._deflection_twists)
-
-    @cached_property
-    def _by_deflections(self) -> Array:
-        """Velocities of the markers in the base by the deflections, (N, k, 3, 3 n)."""
-        return self._marker_velocities(self._deflection_twists)
-
-    def _by_turns(self, turns: Array, direct: Array | float = 0.0) -> Array:
+    def by_turns(self, turns: Array, direct: Array | float = 0.0) -> Array:
         """Derivatives of the places in the tracker's frame, (N, k, 3, P).
 
         Args:
             turns: Turns of the joints before the moments follow, (N, 3 n, P) [rad].
             direct: Velocities of the markers in the base without deflections, (N, k, 3, P).
         """
-        deflections = np.linalg.solve(self._deflection_matrix, turns)
+        matrix, by_deflections = self._deflections
+        deflections = np.linalg.solve(matrix, turns)
         R = self.model.tracker_rotation(self.parameters)
-        return R @ (direct + np.einsum("nkaq,nqp->nkap", self._by_deflections, deflections))
+        return R @ (direct + np.einsum("nkaq,nqp->nkap", by_deflections, deflections))
+
+    @cached_property
+    def _deflections(self) -> tuple[Array, Array]:
+        """1 − c ∂m/∂φ, (N, 3 n, 3 n), and the markers' velocities in the base, (N, k, 3, 3 n)."""
+        housings = np.moveaxis(self.posture.housing, 0, 1)
+        axes = housings @ left_jacobian(self.parameters.compliance * self.loads)
+        twists = _turns_about(axes, turns_housing=False)
+        matrix = np.eye(3 * self.model.num_joints) - self._moment_changes(twists)
+        return matrix, self._marker_velocities(twists)
 
     def _marker_velocities(self, twists: _Twists) -> Array:
         """Velocities of the markers in the base, (N, k, 3, P)."""
@@ -201,9 +147,10 @@ class _SmallMotion:
 
     def _moment_changes(self, twists: _Twists) -> Array:
         """C times the change of the moments in the axes of the housings, (N, 3 n, P) [rad]."""
-        n = self.num_joints
+        n = self.model.num_joints
+        count = len(self.loads)
         is_beyond = self.model.is_beyond
-        changes = np.empty((n, self.num_poses, len(twists.joint), 3))
+        changes = np.empty((n, count, len(twists.joint), 3))
         lever = np.moveaxis(self.posture.lever, 0, 1)
         carried_weight = (is_beyond @ self.model.weight)[twists.joint, None]
         by_carried = np.cross(twists.axis, lever[:, twists.joint])
@@ -219,8 +166,22 @@ class _SmallMotion:
             joint_moment = np.cross(self.posture.lever[j], self.model.down)[:, None]
             moment = moment - np.where(turns, np.cross(twists.axis, joint_moment), 0.0)
             changes[j] = moment @ self.posture.housing[j]
-        stacked = changes.transpose(1, 0, 3, 2).reshape(self.num_poses, 3 * n, -1)
+        stacked = changes.transpose(1, 0, 3, 2).reshape(count, 3 * n, -1)
         return self.parameters.compliance.reshape(-1, 1) * stacked
+
+
+def _nominal_frames(model: GeometryModel, posture: Posture) -> Array:
+    """Axes of the nominal frames behind their parents' links, (N, n, 3, 3)."""
+    base = np.broadcast_to(np.eye(3), posture.link.shape[1:])
+    parents = [base if parent < 0 else posture.link[parent] for parent in model.parent]
+    return np.stack(parents, axis=1) @ model.nominal
+
+
+def _turns_of_joints(posture: Posture) -> _Twists:
+    """Turns of the joints about their own axes, n twists."""
+    axis = np.moveaxis(posture.link[..., 2], 0, 1)
+    n = axis.shape[1]
+    return _Twists(np.arange(n), axis, np.zeros_like(axis), np.zeros(n, dtype=np.bool_))
 
 
 def _turns_about(frames: Array, turns_housing: bool = True) -> _Twists:

@@ -9,12 +9,15 @@ from pydantic import Field
 from baselines.identification.geometry_fit import GeometryEstimate, GeometryFit
 from baselines.identification.geometry_model import Geometry
 from baselines.identification.holdout import HeldOut
-from baselines.identification.result_files import save_result, six_digits, stiffness_interval
+from baselines.identification.result_files import (
+    save_result,
+    stiffness_interval,
+    stiffness_line,
+)
 from baselines.identification.rotation_vectors import rotation_of
 from elastic_env.core.config import Model
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.rotations import matrix_of, quaternion_of
-from elastic_env.core.yaml_text import yaml_line
 from elastic_env.rigid.tree.links import Tree
 
 
@@ -56,11 +59,7 @@ class GeometryIdentification(Model):
         """Write `identification.json`, `joints.yaml` and `model.xml`."""
         head = "# stiffness [N·m/rad], by elastic identify --geometry; .inf for a rigid joint"
         lines = [
-            yaml_line(
-                joint.joint,
-                {"stiffness": six_digits(joint.stiffness_nm_per_rad)},
-                _interval(joint),
-            )
+            stiffness_line(joint.joint, joint.stiffness_nm_per_rad, _interval(joint))
             for joint in self.joints
         ]
         model_file = folder / "model.xml"
@@ -71,9 +70,7 @@ class GeometryIdentification(Model):
 def describe_geometry(fit: GeometryFit, held_out: HeldOut | None) -> GeometryIdentification:
     """Result of a fit."""
     problem = fit.problem
-    compliances = {
-        estimate.name: estimate for estimate in fit.estimates if estimate.kind == "compliance"
-    }
+    compliances = {own.name: own for own in fit.estimates if own.kind == "compliance"}
     return GeometryIdentification(
         poses=len(problem.theta),
         numbers=problem.measured.size,

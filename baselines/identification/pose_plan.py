@@ -15,6 +15,7 @@ do no harm (K. Chaloner and I. Verdinelli, Statistical Science 10(3), 1995).
 """
 
 from dataclasses import dataclass, replace
+from itertools import islice
 
 import mujoco
 import numpy as np
@@ -126,13 +127,11 @@ def candidate_poses(
         return {(int(min(pair)), int(max(pair))) for pair in bodies}
 
     usual = set.intersection(*map(contacts, log.theta if len(log) else [middle]))
-    poses: list[Array] = []
-    for _ in range(_DRAWS_PER_CANDIDATE * CANDIDATES):
-        theta = middle + half * generator.uniform(-1.0, 1.0, len(middle))
-        if contacts(theta) <= usual:
-            poses.append(theta)
-        if len(poses) == CANDIDATES:
-            break
+    draws = (
+        middle + half * generator.uniform(-1.0, 1.0, len(middle))
+        for _ in range(_DRAWS_PER_CANDIDATE * CANDIDATES)
+    )
+    poses = list(islice((theta for theta in draws if contacts(theta) <= usual), CANDIDATES))
     if len(poses) < CANDIDATES // 10:
         raise ElasticError(
             f"only {len(poses)} of {_DRAWS_PER_CANDIDATE * CANDIDATES} random poses are free of"

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from elastic_env.core.config import Model
+from elastic_env.core.yaml_text import yaml_line
 
 
 def stiffness_interval(compliance: float, half_width: float) -> tuple[float | None, float | None]:
@@ -18,9 +19,9 @@ def stiffness_interval(compliance: float, half_width: float) -> tuple[float | No
     return low, high
 
 
-def six_digits(stiffness: float) -> float:
-    """K as `joints.yaml` contains it [N·m/rad]."""
-    return float(f"{stiffness:.6g}")
+def stiffness_line(joint: str, stiffness: float, comment: str) -> str:
+    """Line of `joints.yaml` with K in six digits [N·m/rad]."""
+    return yaml_line(joint, {"stiffness": float(f"{stiffness:.6g}")}, comment)
 
 
 def save_result(result: Model, folder: Path, head: str, joints: Sequence[str]) -> list[Path]:

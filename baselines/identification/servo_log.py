@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -80,20 +80,27 @@ class ServoLog:
 
     def part(self, rows: slice) -> "ServoLog":
         """Log of some of the rows."""
-        return replace(
-            self,
-            time=self.time[rows],
-            goal=self.goal[rows],
-            position=self.position[rows],
-            enabled=self.enabled[rows],
-            pwm=None if self.pwm is None else self.pwm[rows],
-            known=None if self.known is None else self.known[rows],
-        )
+        tables = {field.name: getattr(self, field.name) for field in fields(self)}
+        arrays = {name: own[rows] for name, own in tables.items() if isinstance(own, np.ndarray)}
+        return replace(self, **arrays)
 
     def external_torque(self, q: Array) -> Array:
         """Torque of weight and known torque on the joint, (N,) [N·m]."""
         weight = self.load.pull(q)
         return weight if self.known is None else weight + self.known
+
+    def torque_per_gain(self, limit: float | None) -> Array:
+        """Torque of the motor at standstill over its gain k, as in `Replay`, (N,) [V·rad].
+
+        The register's error is limited before the supply's voltage scales it.
+
+        Args:
+            limit: Torque limit over the gain, T/k [rad]; None for no limit.
+        """
+        error = self.register * (self.goal - self.position)
+        if limit is not None:
+            error = np.clip(error, -limit, limit)
+        return error * self.supply * self.enabled
 
     def derivatives(self) -> tuple[Array, Array]:
         """Speed and acceleration, (N,) [rad/s], [rad/s²]."""

@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import least_squares
 
-from baselines.identification.servo_drive import find_limit_per_gain
 from baselines.identification.servo_log import ServoLog
 from baselines.identification.servo_replay import NAMES, STEP_S, Replay
 from elastic_env.core.errors import ElasticError
@@ -45,6 +44,10 @@ _LONGEST_LEAD_S = 0.2
 _LEAST_TORQUE = 1e-9
 """Largest torque of the load below which the joint counts as unloaded [N·m]."""
 _FEWEST_ROWS_OF_PART = 5
+_FEWEST_ROWS_AT_LIMIT = 20
+"""Rows with the largest PWM that show a torque limit."""
+_LEAST_CORRELATION = 0.98
+"""Correlation of PWM and error above which the PWM is proportional to the error."""
 _FIRST_LIMIT_SHARE = 0.6
 """First torque limit over the largest torque of a servo without limit."""
 
@@ -278,3 +281,29 @@ def _shortest_gap(logs: Sequence[ServoLog]) -> float:
     """Shortest time between the rows before and after a switch of the torque [s]."""
     gaps = [np.diff(log.time)[_switches(log) - 1] for log in logs]
     return float(np.concatenate(gaps).min(initial=_LONGEST_LEAD_S))
+
+
+def find_limit_per_gain(logs: Sequence[ServoLog]) -> float | None:
+    """T/k, limit of the torque over the position gain, from logged PWM [rad]; None if unknown.
+
+    The duty is proportional to g (goal − position) until it stays at its limit.
+    """
+    with_pwm = [(log, log.pwm) for log in logs if log.pwm is not None]
+    highest = 0.0
+    at_limit = 0
+    for _, pwm in with_pwm:
+        highest = max(highest, float(np.abs(pwm).max()))
+        at_limit += int(np.sum(np.abs(pwm) > 0.999 * highest))
+    if highest == 0.0 or at_limit < _FEWEST_ROWS_AT_LIMIT:
+        return None
+    errors = []
+    duties = []
+    for log, pwm in with_pwm:
+        inner = log.enabled & (np.abs(pwm) < 0.98 * highest)
+        errors.append(log.register * (log.goal - log.position)[inner])
+        duties.append(pwm[inner])
+    error = np.concatenate(errors)
+    duty = np.concatenate(duties)
+    slope = float(error @ duty) / float(error @ error)
+    is_proportional = np.corrcoef(error, duty)[0, 1] > _LEAST_CORRELATION
+    return highest / slope if slope > 0.0 and is_proportional else None

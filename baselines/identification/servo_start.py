@@ -6,7 +6,6 @@ The equation of motion is linear in the parameters where the joint moves.
 import numpy as np
 from scipy.optimize import lsq_linear
 
-from baselines.identification.servo_drive import torque_per_gain
 from baselines.identification.servo_log import ServoLog
 from baselines.identification.servo_problem import INDEX, MOVING, ServoProblem
 from baselines.identification.servo_replay import NAMES
@@ -64,7 +63,7 @@ def regress(problem: ServoProblem) -> Array:
 def _motion_equations(log: ServoLog, limit: float | None) -> tuple[Array, Array]:
     """Columns of k, k c, b, B, F, d and o, (N, 7), and right-hand sides, (N,), of moving rows."""
     w, a = log.derivatives()
-    error = torque_per_gain(log, limit)
+    error = log.torque_per_gain(limit)
     moving = np.abs(w) > MOVING
     side = np.sign(w)
     columns = [

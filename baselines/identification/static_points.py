@@ -43,13 +43,11 @@ class StaticPoints:
     @staticmethod
     def join(parts: "Sequence[StaticPoints]") -> "StaticPoints":
         """The points of several loads together, with positions numbered through."""
-        numbered: list[StaticPoints] = []
-        first = 0
-        for load, part in enumerate(parts):
-            numbered.append(
-                replace(part, position=part.position + first, load=np.full(len(part), load))
-            )
-            first += part.position.max() + 1
+        first = np.cumsum([0, *(part.position.max() + 1 for part in parts)])
+        numbered = [
+            replace(part, position=part.position + first[load], load=np.full(len(part), load))
+            for load, part in enumerate(parts)
+        ]
         names = [field.name for field in fields(StaticPoints)]
         columns = {name: np.concatenate([getattr(p, name) for p in numbered]) for name in names}
         return StaticPoints(**columns)

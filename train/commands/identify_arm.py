@@ -16,6 +16,7 @@ from baselines.identification.arm_result import (
 from baselines.identification.geometry_result import GeometryIdentification
 from baselines.identification.holdout import HoldoutProblem
 from baselines.identification.pose_log import PoseLog
+from baselines.identification.pose_plan import plan_further
 from baselines.identification.servo_file import is_servo_log
 from baselines.identification.servo_result import ServoIdentification
 from elastic_env.core.errors import ConfigurationError, quote
@@ -25,7 +26,7 @@ from train.commands.held_out import judge_poses, show_held_out
 from train.commands.identify_arm_tables import remarks, result_table
 from train.commands.identify_geometry import identify_geometry
 from train.commands.identify_options import ArmOptions, IdentificationRun, ServoOptions
-from train.commands.identify_plan import plan_after, plan_first, write_plan
+from train.commands.identify_plan import find_candidates, plan_first, write_plan
 from train.commands.identify_servo import identify_servo
 from train.commands.options import given_options
 from train.figures import plots
@@ -72,8 +73,11 @@ def identify_arm(options: ArmOptions, run: IdentificationRun, console: Console) 
         with show_progress(console, work, transient=True) as show:
             poses = problem.model(problem.log)
             fit = fit_arm(poses, lambda done: show(0, min(done, USUAL_EVALUATIONS)))
-        plan = plan_after(problem, fit, console) if options.plan else None
-        information = None if plan is None else plan.information
+        plan = None
+        information = None
+        if options.plan:
+            plan = plan_further(fit, find_candidates(problem, console), options.plan)
+            information = plan.information
         held_out = judge_poses(HoldoutProblem.from_poses(poses), options.judged, console, run.seed)
         result = describe_fit(fit, options.within, options.assume, information, held_out)
         files = result.save(folder)

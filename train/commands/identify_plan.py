@@ -6,9 +6,9 @@ import mujoco
 import numpy as np
 from rich.console import Console
 
-from baselines.identification.arm_fit import USUAL_NOISE, ArmFit, deviations, noise_text
+from baselines.identification.arm_fit import USUAL_NOISE, deviations, noise_text
 from baselines.identification.pose_log import PoseLog, write_poses
-from baselines.identification.pose_plan import PosePlan, candidate_poses, plan_further, plan_poses
+from baselines.identification.pose_plan import PosePlan, candidate_poses, plan_poses
 from baselines.identification.static_arm import StaticArm
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.joint.model_file import compiled_model, from_mujoco
@@ -23,7 +23,7 @@ _ASSUMED_DEFLECTION_RAD = 0.01
 
 def plan_first(problem: ArmProblem, folder: Path, console: Console) -> None:
     """Plan poses without a log: with usual noise, and deflections of a usual size."""
-    candidates = _candidates(problem, console)
+    candidates = find_candidates(problem, console)
     model = problem.model(candidates)
     noise = USUAL_NOISE[problem.log.kind]
     start = model.start_with(_ASSUMED_DEFLECTION_RAD)
@@ -42,11 +42,6 @@ def plan_first(problem: ArmProblem, folder: Path, console: Console) -> None:
     console.print(f"wrote {write_plan(problem.arm, plan, folder)}")
 
 
-def plan_after(problem: ArmProblem, fit: ArmFit, console: Console) -> PosePlan:
-    """Plan further poses after a fit."""
-    return plan_further(fit, _candidates(problem, console), problem.options.plan)
-
-
 def write_plan(arm: StaticArm, plan: PosePlan, folder: Path) -> Path:
     """Write the poses as `plan.csv`, and return its path."""
     columns = {f"theta.{joint}": plan.theta[:, i] for i, joint in enumerate(arm.joints)}
@@ -56,7 +51,7 @@ def write_plan(arm: StaticArm, plan: PosePlan, folder: Path) -> Path:
     return write_poses(folder / "plan.csv", columns)
 
 
-def _candidates(problem: ArmProblem, console: Console) -> PoseLog:
+def find_candidates(problem: ArmProblem, console: Console) -> PoseLog:
     """Poses to choose from; warns where contacts of the arm are not known."""
     shapes = _model_with_shapes(str(problem.options.robot))
     if not (shapes.geom_contype.any() or shapes.geom_conaffinity.any()):
