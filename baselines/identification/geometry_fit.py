@@ -38,16 +38,13 @@ QUANTILE = 1.96
 """Half-width of a 95 % interval in standard deviations."""
 
 
-UNITS = {
-    "translation": "m",
-    "rotation": "rad",
-    "marker": "m",
-    "offset": "rad",
-    "length": "m",
-    "angle": "rad",
-    "compliance": "rad/(N·m)",
-    "friction": "N·m",
-}
+_UNITS = dict(
+    zip(
+        GeometryParameters._fields,
+        ("m", "rad", "m", "rad", "m", "rad", "rad/(N·m)", "N·m"),
+        strict=True,
+    )
+)
 """Units of the kinds of parameters."""
 
 
@@ -100,7 +97,7 @@ class GeometryFit:
                 name=unknowns.names[i],
                 value=self.x[i],
                 half_width=QUANTILE * deviation[i],
-                unit=UNITS[unknowns.kinds[i]],
+                unit=_UNITS[unknowns.kinds[i]],
                 is_told=bool(deviation[i] < _LARGEST_DEVIATION_RATIO * unknowns.prior[i]),
             )
             for i in range(len(self.x))

@@ -20,7 +20,7 @@ from baselines.identification.geometry_model import (
     GeometryParameters,
     Posture,
 )
-from baselines.identification.rotation_vectors import cross_matrix, left_jacobian
+from baselines.identification.rotations import cross_matrix, left_jacobian
 from elastic_env.core.signals import Array, BoolArray, IntArray
 
 
@@ -47,19 +47,19 @@ def marker_gradient(
     count, k, _ = places.shape
     n = model.num_joints
     is_own = np.eye(3 * n, dtype=np.bool_)
-    by_compliance = motion.by_turns(np.where(is_own, loads.reshape(count, 1, 3 * n), 0.0))
+    by_compliance = motion.turn_gradient(np.where(is_own, loads.reshape(count, 1, 3 * n), 0.0))
     by_friction = np.zeros((count, k, 3, n))
     if axial is not None:
         turns = (-parameters.compliance[:, 2] * axial.direction)[:, None]
-        by_friction = motion.by_turns(np.where(is_own[:, 2::3], turns, 0.0))
+        by_friction = motion.turn_gradient(np.where(is_own[:, 2::3], turns, 0.0))
     return places, GeometryParameters(
         translation=np.broadcast_to(np.eye(3), (count, k, 3, 3)),
         rotation=-cross_matrix(places - model.origin - parameters.translation)
         @ left_jacobian(parameters.rotation),
-        marker=motion.by_marker_places(),
-        offset=-motion.by_twists(_turns_of_joints(posture)),
-        length=motion.by_twists(lengths).reshape(count, k, 3, n, 3),
-        angle=motion.by_twists(angles).reshape(count, k, 3, n, 3),
+        marker=motion.marker_place_gradient(),
+        offset=-motion.twist_gradient(_turns_of_joints(posture)),
+        length=motion.twist_gradient(lengths).reshape(count, k, 3, n, 3),
+        angle=motion.twist_gradient(angles).reshape(count, k, 3, n, 3),
         compliance=by_compliance.reshape(count, k, 3, n, 3),
         friction=by_friction,
     )
@@ -97,7 +97,7 @@ class _SmallMotion:
     posture: Posture
     loads: Array
 
-    def by_marker_places(self) -> Array:
+    def marker_place_gradient(self) -> Array:
         """Derivatives by the places of the markers on their links, (N, k, 3, k, 3)."""
         R = self.model.tracker_rotation(self.parameters)
         k = len(self.model.markers)
@@ -107,11 +107,11 @@ class _SmallMotion:
             gradient[:, i, :, i] = R @ link
         return gradient
 
-    def by_twists(self, twists: _Twists) -> Array:
+    def twist_gradient(self, twists: _Twists) -> Array:
         """Derivatives by twists, (N, k, 3, P)."""
-        return self.by_turns(self._moment_changes(twists), self._marker_velocities(twists))
+        return self.turn_gradient(self._moment_changes(twists), self._marker_velocities(twists))
 
-    def by_turns(self, turns: Array, direct: Array | float = 0.0) -> Array:
+    def turn_gradient(self, turns: Array, direct: Array | float = 0.0) -> Array:
         """Derivatives of the places in the tracker's frame, (N, k, 3, P).
 
         Args:

@@ -28,7 +28,7 @@ from typing import Literal, NamedTuple, Self
 
 import numpy as np
 
-from baselines.identification.rotation_vectors import rotation_about_z, rotation_of
+from baselines.identification.rotations import rotation_about_z, rotation_of
 from elastic_env.core.errors import ElasticError
 from elastic_env.core.signals import Array, BoolArray, IntArray
 from elastic_env.rigid.tree.links import Tree

@@ -14,7 +14,7 @@ from baselines.identification.result_files import (
     stiffness_interval,
     stiffness_line,
 )
-from baselines.identification.rotation_vectors import rotation_of
+from baselines.identification.rotations import rotation_of
 from elastic_env.core.config import Model
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.rotations import matrix_of, quaternion_of
@@ -70,7 +70,7 @@ class GeometryIdentification(Model):
 def describe_geometry(fit: GeometryFit, held_out: HeldOut | None) -> GeometryIdentification:
     """Result of a fit."""
     problem = fit.problem
-    compliances = {own.name: own for own in fit.estimates if own.kind == "compliance"}
+    compliances = {one.name: one for one in fit.estimates if one.kind == "compliance"}
     return GeometryIdentification(
         poses=len(problem.theta),
         numbers=problem.measured.size,

@@ -21,9 +21,8 @@ from scipy.spatial.transform import Rotation
 
 from baselines.identification.pose_log import Kind, PoseLog
 from baselines.identification.pose_unknowns import PoseUnknowns
-from baselines.identification.rotation_vectors import cross_matrix
+from baselines.identification.rotations import cross_matrix, normals_of, vertical
 from baselines.identification.static_arm import Attitude, StaticArm
-from baselines.identification.verticals import normals_of, vertical
 from elastic_env.core.errors import ElasticError
 from elastic_env.core.signals import Array, BoolArray
 from elastic_env.joint.load_continuation import follow_load

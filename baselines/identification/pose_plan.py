@@ -23,8 +23,8 @@ import numpy as np
 from baselines.identification.arm_fit import ArmFit, add_information, information_of
 from baselines.identification.pose_log import AXES, Kind, PoseLog
 from baselines.identification.pose_model import PoseModel
+from baselines.identification.rotations import roll_and_pitch
 from baselines.identification.static_arm import StaticArm
-from baselines.identification.verticals import roll_and_pitch
 from elastic_env.core.errors import ElasticError
 from elastic_env.core.signals import Array, IntArray
 

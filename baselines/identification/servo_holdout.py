@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from baselines.identification.rivals import predict_linear
 from baselines.identification.servo_fit import ServoFit
 from baselines.identification.servo_log import FEWEST_ROWS, ServoLog, slow_rows
 from elastic_env.core.config import Model
@@ -105,24 +106,17 @@ def rivals(fitted: Sequence[ServoLog], log: ServoLog, *, slow: bool = False) -> 
     """
     powered = [other for other in fitted if other.enabled.any()]
     alike = [other for other in powered if other.gain == log.gain] or powered
-    offset = 0.0
-    line = np.array([0.0, 1.0])
-    if alike:
-        rows = [slow_rows(other) if slow else other.enabled for other in alike]
-        if not any(part.any() for part in rows):
-            rows = [other.enabled for other in alike]
-        chosen = list(zip(alike, rows, strict=True))
-        goal = np.concatenate([other.goal[part] for other, part in chosen])
-        position = np.concatenate([other.position[part] for other, part in chosen])
-        offset = float(np.mean(position - goal))
-        line = fit_line(goal, position)
-    return np.stack([log.goal, log.goal + offset, line[0] + line[1] * log.goal])
-
-
-def fit_line(goal: Array, position: Array) -> Array:
-    """Constant and slope of the least-squares line, (2,)."""
-    rows = np.column_stack([np.ones(len(goal)), goal])
-    return np.linalg.lstsq(rows, position, rcond=None)[0]
+    if not alike:
+        return np.stack([log.goal] * 3)
+    rows = [slow_rows(other) if slow else other.enabled for other in alike]
+    if not any(part.any() for part in rows):
+        rows = [other.enabled for other in alike]
+    chosen = list(zip(alike, rows, strict=True))
+    goal = np.concatenate([other.goal[part] for other, part in chosen])
+    position = np.concatenate([other.position[part] for other, part in chosen])
+    offset = float(np.mean(position - goal))
+    line = predict_linear(goal[:, None], position[:, None], log.goal[:, None])[:, 0]
+    return np.stack([log.goal, log.goal + offset, line])
 
 
 def split_logs(

@@ -43,7 +43,8 @@ def half_widths(problem: ServoProblem, z: Array, free: IntArray) -> Array:
     """
     r = problem.residual(z, thinned=False)
     J = _gradient(problem, z, free, r)
-    changes = np.stack([_change_by_steps(problem, z, r), *_changes_by_starts(problem, z, r)], -1)
+    by_steps = problem.with_steps(0.5 * STEP_S).residual(z, thinned=False) - r
+    changes = np.stack([by_steps, *_changes_by_starts(problem, z, r)], axis=-1)
     r[len(r) - PRIORS :] = problem.weight  # expected deviation of a prior
     at_bound = (z[free] - problem.lower[free] < _BOUND_MARGIN) | (
         problem.upper[free] - z[free] < _BOUND_MARGIN
@@ -73,11 +74,6 @@ def _widths(problem: ServoProblem, J: Array, r: Array, changes: Array, num_free:
     clusters = len(np.unique(blocks[-1]))
     quantile = float(student.ppf(0.975, max(clusters - num_free, _LEAST_FREEDOM)))
     return quantile * np.sqrt(variance) + 2.0 * np.abs(shifts[:, 0])
-
-
-def _change_by_steps(problem: ServoProblem, z: Array, r: Array) -> Array:
-    """Change of the residuals r by halved steps, (N,)."""
-    return problem.with_steps(0.5 * STEP_S).residual(z, thinned=False) - r
 
 
 def _changes_by_starts(problem: ServoProblem, z: Array, r: Array) -> list[Array]:

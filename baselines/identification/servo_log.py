@@ -194,7 +194,7 @@ def read_servo_log(
         enabled=enabled,
         gain=gain,
         load=load or NO_LOAD,
-        pwm=None if pwm is None or not pwm.any() else _signed(pwm),
+        pwm=None if pwm is None or not pwm.any() else _sign_extend(pwm),
         known=columns.get("known"),
         supply=float(np.median(columns["voltage"]))
         if "voltage" in columns
@@ -355,7 +355,7 @@ def _require_plausible_goal(path: Path, log: ServoLog) -> None:
         )
 
 
-def _signed(register: Array) -> Array:
-    """Signed values of a register of 16 bits that was read as unsigned; others are unchanged."""
+def _sign_extend(register: Array) -> Array:
+    """Correct a register of 16 bits that was read without its sign; other values are unchanged."""
     is_register = register.max() > 2**15 and register.max() < 2**16
     return np.where(register > 2**15, register - 2**16, register) if is_register else register

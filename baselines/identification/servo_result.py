@@ -140,7 +140,7 @@ def describe_servo(
             for register, volts in registers
         ),
         parameters=parameters,
-        untold=tuple(_undetermined(fit, parameters)),
+        untold=tuple(_undetermined_quantities(fit, parameters)),
         supply_v=None if supply == 1.0 else supply,
         held_out=held_out,
     )
@@ -191,7 +191,7 @@ def _parameter(fit: ServoFit, name: str, supply: float) -> ServoParameter:
     )
 
 
-def _undetermined(fit: ServoFit, parameters: Sequence[ServoParameter]) -> list[str]:
+def _undetermined_quantities(fit: ServoFit, parameters: Sequence[ServoParameter]) -> list[str]:
     """Quantities that the logs do not determine, each with its reason and its cure."""
     lines = []
     has_torque = any(log.enabled.any() for log in fit.logs)

@@ -89,11 +89,8 @@ class Identify(IdentificationRun):
             draw_identification(results[0], points[0], models, files[1])
             console.print(result_table(results[0]))
             if self.testbed.repeats > 1:
-                seeds = range(self.seed, self.seed + self.testbed.repeats)
-                rows = [
-                    {"seed": seed, **result.model_dump()}
-                    for seed, result in zip(seeds, results, strict=True)
-                ]
+                numbered = enumerate(results, self.seed)
+                rows = [{"seed": seed, **result.model_dump()} for seed, result in numbered]
                 files.append(write_records(rows, folder / "repeats.csv"))
                 truth = float(envs[0].unwrapped.truth().model.stiffness[0])
                 console.print(_repeats_summary(pd.DataFrame(rows), results, truth))

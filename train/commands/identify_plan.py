@@ -67,11 +67,11 @@ def _model_with_shapes(path: str) -> mujoco.MjModel:
     """The model with its collision shapes, or without them where MuJoCo cannot read them."""
     plain = compiled_model(path)
 
-    def read() -> mujoco.MjModel:
+    def compile_shapes() -> mujoco.MjModel:
         return mujoco.MjSpec.from_file(path).compile()
 
     try:
-        shaped = from_mujoco(read, "the shapes of the model", "read")
+        shaped = from_mujoco(compile_shapes, "the shapes of the model", "read")
     except ConfigurationError:
         return plain
     return shaped if set(hinges_of(plain)) <= set(hinges_of(shaped)) else plain

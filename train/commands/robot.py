@@ -211,12 +211,10 @@ def _gallery_arguments(name: str) -> dict[str, Any]:
         spec.body(entry.end_effector).add_site(name=_TIP, pos=entry.tip)
         spec.compile()
         model = spec.to_xml()
+    assumed = gallery_joints(name).items()
     return {
         "model": model,
-        "joints": {
-            joint: settings.model_dump(include=_ASSUMED)
-            for joint, settings in gallery_joints(name).items()
-        },
+        "joints": {joint: settings.model_dump(include=_ASSUMED) for joint, settings in assumed},
         "end_effector": end_effector,
         "home": dict(entry.home),
     }
