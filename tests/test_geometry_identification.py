@@ -202,7 +202,6 @@ def test_the_corrected_model_is_the_identified_arm(
         geometry,
         theta,
         geometry.predict_markers(geometry.nominal_parameters(), theta),
-        JOINTS,
         "full",
     )
     x = problem.unknowns.prior * generator.standard_normal(len(problem.unknowns.prior))
@@ -225,7 +224,7 @@ def made_up(
     """Poses of an arm whose parameters are drawn from their priors, and those parameters."""
     generator, theta = draw(seed, count)
     blank = np.zeros((count, len(SITES), 3))
-    problem = GeometryProblem(arm, theta, blank, JOINTS, elastic=JOINTS, **options)  # type: ignore[arg-type]
+    problem = GeometryProblem(arm, theta, blank, elastic=JOINTS, **options)  # type: ignore[arg-type]
     prior = problem.unknowns.prior
     truth = prior * generator.standard_normal(len(prior))
     kinds = np.array(problem.unknowns.kinds)
@@ -235,7 +234,7 @@ def made_up(
     truth[own] = prior[own] * generator.uniform(0.1, 0.6, len(own))
     shown = arm.predict_markers(problem.parameters(truth), theta, problem.axial)
     measured = shown + noise_m * generator.standard_normal(blank.shape)
-    return GeometryProblem(arm, theta, measured, JOINTS, elastic=JOINTS, **options), truth  # type: ignore[arg-type]
+    return GeometryProblem(arm, theta, measured, elastic=JOINTS, **options), truth  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
@@ -278,7 +277,7 @@ def test_friction_of_known_sides_is_told_apart_from_stiffness() -> None:
         fit = fit_geometry(arm_with_friction(seed))
         found = {(own.kind, own.name): own for own in fit.estimates}
         for kind, truth in truths.items():
-            for joint, value in zip(fit.problem.joints, truth, strict=True):
+            for joint, value in zip(fit.problem.model.joints, truth, strict=True):
                 own = found[kind, joint]
                 if own.is_told:
                     held.append(abs(own.value - value) < own.half_width)
@@ -295,7 +294,7 @@ def test_sides_of_approach_lower_the_noise() -> None:
     fit = fit_geometry(problem)
     assert fit.noise_m < 0.6 * blind.noise_m
     found = {own.name: own for own in fit.estimates if own.kind == "friction"}
-    for joint, truth in zip(problem.joints, test_arm_identification.FRICTION, strict=True):
+    for joint, truth in zip(problem.model.joints, test_arm_identification.FRICTION, strict=True):
         assert abs(found[joint].value - truth) < 4.0 * found[joint].half_width / QUANTILE
     assert found["elbow"].is_told
 
@@ -319,7 +318,7 @@ def test_masses_that_are_guessed_hardly_matter(geometry: GeometryModel) -> None:
         scaled = replace(
             geometry, weight=scale * geometry.weight, weight_moment=scale * geometry.weight_moment
         )
-        own = GeometryProblem(scaled, problem.theta, problem.measured, JOINTS, "dh", JOINTS)
+        own = GeometryProblem(scaled, problem.theta, problem.measured, "dh", JOINTS)
         errors.append(
             judge(HoldoutProblem.from_geometry(own), parts, 0, lambda done: None).errors[-1].rms
         )
@@ -438,7 +437,7 @@ def test_the_tracker_is_aligned_before_the_fit(geometry: GeometryModel) -> None:
         rotation=np.array([0.0, 0.0, 3.0]), translation=np.array([1.0, -2.0, 0.5])
     )
     measured = geometry.predict_markers(turned, theta)
-    own = GeometryProblem(geometry, theta, measured, JOINTS).align().model
+    own = GeometryProblem(geometry, theta, measured).align().model
     shown = own.predict_markers(own.nominal_parameters(), theta)
     np.testing.assert_allclose(shown, measured, atol=1e-9)
 

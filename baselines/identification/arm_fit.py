@@ -27,8 +27,8 @@ from baselines.identification.pose_checks import (
     require_poses,
     require_signs,
 )
-from baselines.identification.pose_log import Kind
-from baselines.identification.pose_model import PoseModel, measurement_unit
+from baselines.identification.pose_log import MEASUREMENT_UNITS, Kind
+from baselines.identification.pose_model import PoseModel
 from baselines.identification.prior_least_squares import information_with_prior, solve_with_prior
 from elastic_env.core.errors import ElasticError
 from elastic_env.core.signals import Array, IntArray
@@ -239,7 +239,7 @@ def _cluster_robust_covariance(rows: Array, residual: Array, inverse: Array) -> 
 
 def noise_text(noise: float, kind: Kind) -> str:
     """Noise of a measurement with its unit, as tables show it."""
-    unit = measurement_unit(kind)
+    unit = MEASUREMENT_UNITS[kind]
     return f"{noise:.3g} {unit}" if unit == "N·m" else f"{1e3 * noise:.3g} m{unit}"
 
 

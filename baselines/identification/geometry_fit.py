@@ -38,13 +38,16 @@ QUANTILE = 1.96
 """Half-width of a 95 % interval in standard deviations."""
 
 
-_UNITS = dict(
-    zip(
-        GeometryParameters._fields,
-        ("m", "rad", "m", "rad", "m", "rad", "rad/(N·m)", "N·m"),
-        strict=True,
-    )
-)
+_UNITS = {
+    "translation": "m",
+    "rotation": "rad",
+    "marker": "m",
+    "offset": "rad",
+    "length": "m",
+    "angle": "rad",
+    "compliance": "rad/(N·m)",
+    "friction": "N·m",
+}
 """Units of the kinds of parameters."""
 
 

@@ -73,7 +73,6 @@ class GeometryProblem:
         model: Markers as a function of parameters.
         theta: Motor encoders, (N, n) [rad].
         measured: Places of the markers, (N, k, 3) [m].
-        joints: Names of the joints, (n,).
         geometry: Unknown part of the geometry.
         elastic: Joints whose stiffness is unknown; none for a rigid arm.
         lateral: True if their lateral compliance is unknown too.
@@ -85,7 +84,6 @@ class GeometryProblem:
     model: GeometryModel
     theta: Array
     measured: Array
-    joints: tuple[str, ...]
     geometry: Geometry = "offsets"
     elastic: tuple[str, ...] = ()
     lateral: bool = False
@@ -165,7 +163,7 @@ class GeometryProblem:
             add("rotation", axis, 0, unit, priors.frame_rad)
             for i, marker in enumerate(self.model.markers):
                 add("marker", f"{marker.name}.{axis}", 3 * i, unit, priors.marker_m)
-        for j, joint in enumerate(self.joints):
+        for j, joint in enumerate(self.model.joints):
             is_free = joint in self.free
             scalar = np.ones(1)
             add("offset", joint, j, scalar, priors.frame_rad if is_free else priors.offset_rad)

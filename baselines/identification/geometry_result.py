@@ -77,7 +77,9 @@ def describe_geometry(fit: GeometryFit, held_out: HeldOut | None) -> GeometryIde
         geometry=problem.geometry,
         lateral=problem.lateral,
         noise_mm=1e3 * fit.noise_m,
-        joints=tuple(_joint_compliance(joint, compliances.get(joint)) for joint in problem.joints),
+        joints=tuple(
+            _joint_compliance(joint, compliances.get(joint)) for joint in problem.model.joints
+        ),
         parameters=fit.estimates,
         held_out=held_out,
     )
@@ -105,7 +107,7 @@ def correct_model(spec: mujoco.MjSpec, tree: Tree, fit: GeometryFit) -> mujoco.M
     if spec.textures:
         corrected.texturedir = str(Path(spec.modelfiledir, spec.texturedir).resolve())
     problem = fit.problem
-    for j, joint in enumerate(problem.joints):
+    for j, joint in enumerate(problem.model.joints):
         body = int(model.joint(joint).bodyid[0])
         if model.body_jntnum[body] != 1:
             raise ConfigurationError(

@@ -27,6 +27,8 @@ KINDS: dict[str, tuple[Kind, str]] = {
     "torque": ("torques", "N·m"),
 }
 """Kind of measurement and unit by the quantity of a column."""
+MEASUREMENT_UNITS: dict[Kind, str] = dict(KINDS.values())
+"""Unit by the kind of measurement."""
 AXES: dict[Kind, tuple[str, ...]] = {"end_effector": ("x", "y", "z"), "imu": ("roll", "pitch")}
 """Columns of measurements that are not made at joints."""
 UNITS = {

@@ -19,7 +19,7 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from baselines.identification.pose_log import Kind, PoseLog
+from baselines.identification.pose_log import PoseLog
 from baselines.identification.pose_unknowns import PoseUnknowns
 from baselines.identification.rotations import cross_matrix, normals_of, vertical
 from baselines.identification.static_arm import Attitude, StaticArm
@@ -292,8 +292,3 @@ class PoseModel:
         if self.unknowns.payload:
             gradient[..., parts["payload"]] += self.arm.payload_torque(q)[..., None]
         return self.torque(unknowns, q)[:, joints], gradient[:, joints]
-
-
-def measurement_unit(kind: Kind) -> str:
-    """Unit of a measurement's residual."""
-    return {"end_effector": "m", "torques": "N·m"}.get(kind, "rad")

@@ -195,7 +195,7 @@ def find_rigid(poses: RecordedPoses, mass_factors: Array = _AS_GUESSED) -> mujoc
     few = poses.of(np.arange(min(_POSES_OF_SEARCH, len(poses.theta))))
     spec = justin_spec(find_shoulders(few), mass_factors)
     problem = _problem(spec, poses, tuple(_MARKERS)).as_rigid()
-    return correct_model(spec, _tree(spec, problem.joints), fit_geometry(problem))
+    return correct_model(spec, _tree(spec, problem.model.joints), fit_geometry(problem))
 
 
 def _problem(
@@ -216,7 +216,6 @@ def _problem(
         model=GeometryModel.from_tree(_tree(spec, joints), joints, model.opt.gravity, places),
         theta=poses.theta[:, columns],
         measured=poses.measured[:, markers],
-        joints=joints,
         geometry=geometry,
         elastic=joints,
         lateral=lateral,

@@ -89,7 +89,6 @@ def pose_problem(
         model=GeometryModel.from_tree(tree, log.joints, model.opt.gravity, markers),
         theta=log.theta,
         measured=log.measured.reshape(len(log), len(names), 3),
-        joints=log.joints,
         geometry=options.geometry or "offsets",
         elastic=tuple(elastic),
         lateral=options.lateral,
