@@ -43,10 +43,10 @@ class Iterate(Model):
 
     No training in simulation is needed.
 
-    After each trial the measurements of IMU and foot sensors, or on the testbed of the link's IMU,
-    correct the offsets of the next one at the same time of the motion. Prints a table of the
-    trials; trial 0 is the base, the last one has all learned offsets. Writes the learned offsets as
-    a policy iterative:FOLDER, trials.csv and a picture.
+    After each trial the measurements of IMU and foot sensors correct the offsets of the next trial
+    at the same time of the motion. On the testbed these are the measurements of the link's IMU.
+    Prints a table of the trials; trial 0 is the base, the last one has all learned offsets. Writes
+    the learned offsets as a policy iterative:FOLDER, trials.csv and a picture.
 
     Example: elastic iterate --scenario soft --trials 10
 

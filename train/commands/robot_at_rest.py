@@ -47,8 +47,8 @@ def joint_shares(plant: JointPlant) -> pd.DataFrame:
 
     Returns:
         A row for each joint: K; the gain k_p of its servo, infinite where that holds its angle;
-        and its share. Rms over the poses of gravity torque, of deflection from the command, of the
-        end effector's displacement by this deflection alone, and of that by friction F, F/K.
+        and its share. Rms values over the poses: gravity torque; deflection from the command;
+        displacement of the end effector by this deflection alone; the same by friction, F/K.
     """  # noqa: E501
     tool = plant.end_effector
     assert tool is not None
