@@ -210,8 +210,8 @@ def test_a_known_torque_tells_a_joint_that_gravity_does_not_load(tmp_path: Path)
     columns |= {f"q.{joint}": q[:, i] for i, joint in enumerate(JOINTS)}
     path = write_poses(tmp_path / "poses.csv", columns | {"tau_known.base_yaw": pull[:, 0]})
     log = read_log(path, RANGES)
-    assert log.known is not None
-    np.testing.assert_allclose(log.known, pull, rtol=1e-8)
+    assert log.known_torque is not None
+    np.testing.assert_allclose(log.known_torque, pull, rtol=1e-8)
     assert np.abs(errors(fit_arm(model_of(log)))).max() < 1e-4
 
 

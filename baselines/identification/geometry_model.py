@@ -89,16 +89,16 @@ class AxialTorques(NamedTuple):
 
     Attributes:
         direction: Side of approach, (N, n): +1 from below, −1 from above, 0 unknown [1].
-        known: Known torque besides the weight, (N, n) [N·m], positive where it turns the joint
-            forward.
+        known_torque: Known torque besides the weight, (N, n) [N·m], positive where it turns the
+            joint forward.
     """
 
     direction: Array
-    known: Array
+    known_torque: Array
 
     def part(self, poses: IntArray) -> "AxialTorques":
         """Torques of some of the poses."""
-        return AxialTorques(self.direction[poses], self.known[poses])
+        return AxialTorques(self.direction[poses], self.known_torque[poses])
 
 
 class Posture(NamedTuple):
@@ -281,7 +281,7 @@ class GeometryModel:
         """Moments that bend the joints, in the axes of the housings, (N, n, 3) [N·m]."""
         moments = self.moments(posture)
         if axial is not None:
-            moments[..., 2] += axial.known - parameters.friction * axial.direction
+            moments[..., 2] += axial.known_torque - parameters.friction * axial.direction
         return moments
 
     def tracker_rotation(self, parameters: GeometryParameters) -> Array:

@@ -139,7 +139,7 @@ class GeometryProblem:
         rigid = self.model.posture(self.model.nominal_parameters(), self.theta)
         loads = self.model.moments(rigid)
         if self.axial is not None:
-            loads[..., 2] += self.axial.known
+            loads[..., 2] += self.axial.known_torque
         moments = np.abs(loads).max(axis=0)
         return np.maximum(moments, _SMALLEST_MOMENT * max(float(moments.max()), 1e-9))
 

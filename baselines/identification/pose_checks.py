@@ -157,7 +157,7 @@ def reverse_joint(log: PoseLog, joint: str) -> PoseLog:
         theta=_negate(log.theta, column),
         measured=measured,
         direction=_negate(log.direction, column),
-        known=_negate(log.known, column),
+        known_torque=_negate(log.known_torque, column),
     )
 
 

@@ -41,7 +41,7 @@ UNITS = {
 MOST_POSES = 10_000
 """Rows of a log."""
 
-_TABLES = ("theta", "measured", "direction", "known")
+_TABLES = ("theta", "measured", "direction", "known_torque")
 """Fields of a log with a row per pose."""
 _UNIT_SPELLINGS = {"Nm": "N·m", "N*m": "N·m", "N m": "N·m", "": "1", "-": "1"}
 _RANGE_MARGIN_RAD = 0.5
@@ -64,8 +64,8 @@ class PoseLog:
         measured: The measurement, (N, m), in the unit of its kind.
         direction: Side of approach, (N, n): +1 from below, -1 from above, 0 unknown; None where the
             log has none.
-        known: Known further torque on the joints, (N, n) [N·m], positive where it turns the joint
-            forward; None where the log has none.
+        known_torque: Known further torque on the joints, (N, n) [N·m], positive where it turns the
+            joint forward; None where the log has none.
     """
 
     joints: tuple[str, ...]
@@ -74,7 +74,7 @@ class PoseLog:
     columns: tuple[str, ...]
     measured: Array
     direction: Array | None = None
-    known: Array | None = None
+    known_torque: Array | None = None
 
     def __len__(self) -> int:
         return len(self.theta)
@@ -127,7 +127,7 @@ def read_log(
         columns=order,
         measured=_table(columns, quantity, order),
         direction=_table(columns, "direction", joints) if names["direction"] else None,
-        known=_table(columns, "tau_known", joints) if names["tau_known"] else None,
+        known_torque=_table(columns, "tau_known", joints) if names["tau_known"] else None,
     )
     sides = np.zeros(0) if log.direction is None else log.direction.ravel()
     if len(wrong := sides[~np.isin(sides, (-1.0, 0.0, 1.0))]):
@@ -158,7 +158,10 @@ def average_poses(log: PoseLog) -> PoseLog:
     starts = [0]
     for row in range(1, len(log)):
         moved = np.abs(log.theta[row] - log.theta[starts[-1]]).max() > _EQUAL_WITHIN_RAD
-        moved |= log.known is not None and (log.known[row] != log.known[starts[-1]]).any()
+        moved |= (
+            log.known_torque is not None
+            and (log.known_torque[row] != log.known_torque[starts[-1]]).any()
+        )
         if moved or (sides[row] != sides[starts[-1]]).any():
             starts.append(row)
     count = np.diff([*starts, len(log)])[:, None]
@@ -167,7 +170,9 @@ def average_poses(log: PoseLog) -> PoseLog:
         theta=np.add.reduceat(log.theta, starts) / count,
         measured=np.add.reduceat(log.measured, starts) / count,
         direction=None if log.direction is None else sides[starts],
-        known=None if log.known is None else np.add.reduceat(log.known, starts) / count,
+        known_torque=None
+        if log.known_torque is None
+        else np.add.reduceat(log.known_torque, starts) / count,
     )
 
 

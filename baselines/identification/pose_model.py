@@ -142,7 +142,7 @@ class PoseModel:
     def _weight(self, q: Array) -> Array:
         """Torques that hold the arm against its weight and known torques, (N, n) [N·m]."""
         torque = self.arm.torque(q)
-        return torque if self.log.known is None else torque - self.log.known
+        return torque if self.log.known_torque is None else torque - self.log.known_torque
 
     def link_angles(self, unknowns: Array) -> tuple[Array, Array]:
         """Link angles at rest, (N, n) [rad], and (1 + C ∂τ/∂q)⁻¹ there, (N, n, n).

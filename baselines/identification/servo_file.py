@@ -128,7 +128,7 @@ def _read_csv(path: Path, joint: str | None) -> Content:
             )
         if unit == "rad":
             units[name] = file_unit
-        field = "known" if is_torque else name
+        field = "known_torque" if is_torque else name
         if field in columns:
             cure = "name the joint by --joints" if is_torque else "keep one of them"
             raise ConfigurationError(f"{path} has several columns {name.partition('.')[0]}; {cure}")

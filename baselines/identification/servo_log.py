@@ -55,7 +55,7 @@ class ServoLog:
         gain: Value of the servo's gain register [1]; None if it is not known.
         load: Load of the joint.
         pwm: Duty of the motor's voltage in any unit, (N,); None if not logged.
-        known: Known further torque on the joint, (N,) [N·m]; None if there is none.
+        known_torque: Known further torque on the joint, (N,) [N·m]; None if there is none.
         supply: Voltage of the supply [V]; 1 if it is not known.
     """
 
@@ -67,7 +67,7 @@ class ServoLog:
     gain: float | None = None
     load: Load = NO_LOAD
     pwm: Array | None = None
-    known: Array | None = None
+    known_torque: Array | None = None
     supply: float = 1.0
 
     def __len__(self) -> int:
@@ -87,7 +87,7 @@ class ServoLog:
     def external_torque(self, q: Array) -> Array:
         """Torque of weight and known torque on the joint, (N,) [N·m]."""
         weight = self.load.pull(q)
-        return weight if self.known is None else weight + self.known
+        return weight if self.known_torque is None else weight + self.known_torque
 
     def torque_per_gain(self, limit: float | None) -> Array:
         """Torque of the motor at standstill over its gain k, as in `Replay`, (N,) [V·rad].
@@ -195,12 +195,12 @@ def read_servo_log(
         gain=gain,
         load=load or NO_LOAD,
         pwm=None if pwm is None or not pwm.any() else _sign_extend(pwm),
-        known=columns.get("known"),
+        known_torque=columns.get("known_torque"),
         supply=float(np.median(columns["voltage"]))
         if "voltage" in columns
         else facts.get("vin", 1.0),
     )
-    if load is None and log.known is None:
+    if load is None and log.known_torque is None:
         raise ConfigurationError(
             f"{path} does not say what hangs on the joint; give --mass-kg and --lever-m of a"
             " pendulum, --robot with --joints, or a column tau_known [N·m]"

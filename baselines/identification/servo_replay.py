@@ -62,13 +62,13 @@ class Replay:
         log: The log.
         start: Angle and speed at the first row [rad], [rad/s].
         middle: Times of the middles of the steps, (N − 1, s) [s].
-        known: Known torque at these times, (N − 1, s) [N·m].
+        known_torque: Known torque at these times, (N − 1, s) [N·m].
     """
 
     log: ServoLog
     start: tuple[float, float]
     middle: Array
-    known: Array
+    known_torque: Array
 
     @staticmethod
     def from_log(
@@ -86,8 +86,8 @@ class Replay:
         count = max(1, int(np.ceil(np.median(step) / longest_s)))
         middle = log.time[:-1, None] + step[:, None] * (np.arange(count) + 0.5) / count
         known = np.zeros_like(middle)
-        if log.known is not None:
-            known = np.interp(middle, log.time, log.known)
+        if log.known_torque is not None:
+            known = np.interp(middle, log.time, log.known_torque)
         angle = float(log.position[0]) if angle is None else angle
         return Replay(log, (angle, speed), middle, known)
 
@@ -101,7 +101,7 @@ class Replay:
         _play(
             np.diff(log.time),
             goal,
-            self.known,
+            self.known_torque,
             log.enabled,
             self._switched_shares(parameters[12]),
             np.array([*self.start, log.register, log.supply, load.torque, load.rest, inertia]),

@@ -125,7 +125,7 @@ def joint_logs(recording: Recording, arm: LeRobotArm) -> list[ServoLog]:
             position=position[:, joint],
             enabled=np.ones(len(goal), dtype=np.bool_),
             load=Load(inertia=float(inertia[joint])),
-            known=known[:, joint],
+            known_torque=known[:, joint],
         )
         for joint, name in enumerate(arm.compensator.joints)
     ]

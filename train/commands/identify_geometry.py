@@ -101,12 +101,12 @@ def pose_problem(
 
 def _axial_torques(log: PoseLog) -> AxialTorques | None:
     """Sides of approach and known torques of a log; None where it has neither."""
-    if log.direction is None and log.known is None:
+    if log.direction is None and log.known_torque is None:
         return None
     nothing = np.zeros_like(log.theta)
     return AxialTorques(
         direction=nothing if log.direction is None else log.direction,
-        known=nothing if log.known is None else log.known,
+        known_torque=nothing if log.known_torque is None else log.known_torque,
     )
 
 
