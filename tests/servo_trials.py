@@ -93,7 +93,7 @@ def _record(log: ServoLog, truth: Array, rng: np.random.Generator) -> ServoLog:
     at = np.minimum(np.searchsorted(log.time, told, side="right") - 1, len(log.time) - 1)
     dense = replace(dense, enabled=log.enabled[at])
     at_once = np.where(np.array(NAMES) == "switch_lead", 0.0, truth)
-    q = Replay.of(dense).play(at_once)[::100][: len(log.time)]
+    q = Replay.from_log(dense).play(at_once)[::100][: len(log.time)]
     q = q + NOISE_RAD * rng.normal(size=len(q))
     return replace(log, position=np.round(q / COUNT_RAD) * COUNT_RAD)
 

@@ -25,12 +25,15 @@ from scipy.optimize import root
 from scipy.spatial.transform import Rotation
 
 from baselines import PositionCompensator
-from baselines.identification.arm_fit import ArmFit, fit_arm, information_of, turn_joint
+from baselines.identification.arm_fit import ArmFit, fit_arm, information_of
 from baselines.identification.arm_result import JointStiffness, bounded_compliance, describe_fit
-from baselines.identification.holdout import FITTED, RIGID, RIVALS, HeldOut, Judged, judge, split
+from baselines.identification.holdout import FITTED, RIGID, HeldOut, HoldoutProblem, judge, split
+from baselines.identification.pose_checks import reverse_joint
 from baselines.identification.pose_log import Kind, PoseLog, read_log, write_poses
-from baselines.identification.pose_model import PoseModel, Unknowns
+from baselines.identification.pose_model import PoseModel
 from baselines.identification.pose_plan import candidate_poses, plan_further
+from baselines.identification.pose_unknowns import PoseUnknowns
+from baselines.identification.rivals import RIVALS
 from baselines.identification.static_arm import StaticArm
 from elastic_env.core.errors import ConfigurationError, ElasticError
 from elastic_env.core.signals import Array
@@ -40,7 +43,7 @@ from elastic_env.joint.joint_names import JointAddresses
 from elastic_env.joint.make_elastic import make_elastic
 from train.commands.cli import main
 from train.commands.held_out import judge_poses
-from train.commands.identify_arm import result_table
+from train.commands.identify_arm_tables import result_table
 from train.commands.identify_options import HoldoutOptions
 from train.figures.identification_plots import deflections
 
@@ -130,7 +133,9 @@ def model_of(log: PoseLog, elastic: tuple[str, ...] = JOINTS, **options: Any) ->
     """The model of a log."""
     arm = StaticArm(ARM, JOINTS, "marker", options.get("payload"))
     return PoseModel(
-        arm, log, Unknowns.of(log, elastic, options.get("frame", "offset"), "payload" in options)
+        arm,
+        log,
+        PoseUnknowns.from_log(log, elastic, options.get("frame", "offset"), "payload" in options),
     )
 
 
@@ -205,8 +210,8 @@ def test_a_known_torque_tells_a_joint_that_gravity_does_not_load(tmp_path: Path)
     columns |= {f"q.{joint}": q[:, i] for i, joint in enumerate(JOINTS)}
     path = write_poses(tmp_path / "poses.csv", columns | {"tau_known.base_yaw": pull[:, 0]})
     log = read_log(path, RANGES)
-    assert log.known is not None
-    np.testing.assert_allclose(log.known, pull, rtol=1e-8)
+    assert log.known_torque is not None
+    np.testing.assert_allclose(log.known_torque, pull, rtol=1e-8)
     assert np.abs(errors(fit_arm(model_of(log)))).max() < 1e-4
 
 
@@ -244,7 +249,7 @@ def test_payload_is_found_with_the_stiffness() -> None:
     spec.body("link7").add_site(name="weight", pos=place)
     log = log_of("end_effector", 5, count=60)
     arm = StaticArm(spec.compile(), JOINTS, "marker", "weight")
-    fit = fit_arm(PoseModel(arm, log, Unknowns.of(log, JOINTS, "offset", payload=True)))
+    fit = fit_arm(PoseModel(arm, log, PoseUnknowns.from_log(log, JOINTS, "offset", payload=True)))
     mass, half = fit.estimate("payload")
     assert abs(mass[0] - 0.9) < half[0] < 0.3
     compliance, width = fit.estimate("compliance")
@@ -332,7 +337,9 @@ def test_joints_that_move_alike_are_named_together() -> None:
         0, 1e-4, (30, 3)
     )
     log = PoseLog(("a", "b"), theta, "end_effector", ("x", "y", "z"), measured)
-    fit = fit_arm(PoseModel(arm, log, Unknowns.of(log, ("a", "b"), "known", payload=False)))
+    fit = fit_arm(
+        PoseModel(arm, log, PoseUnknowns.from_log(log, ("a", "b"), "known", payload=False))
+    )
     reasons = [joint.reason for joint in describe_fit(fit, 0.03, 1000.0).joints]
     assert reasons == [
         "these poses do not separate it from b",
@@ -586,7 +593,7 @@ def fit_of(arm: StaticArm, log: PoseLog) -> Array:
     return (
         1.0
         / fit_arm(
-            PoseModel(arm, log, Unknowns.of(log, log.joints, "offset", payload=False))
+            PoseModel(arm, log, PoseUnknowns.from_log(log, log.joints, "offset", payload=False))
         ).estimate("compliance")[0]
     )
 
@@ -613,10 +620,10 @@ def test_a_joint_that_turns_the_other_way_is_named(joint: str) -> None:
     arm, log = encoders(TWO, [300.0, 150.0], count=20)
     np.testing.assert_allclose(fit_of(arm, log), [300.0, 150.0], rtol=2e-3)
     with pytest.raises(ConfigurationError, match=rf"a sign is wrong \(joint .*{joint}.*\)"):
-        fit_of(arm, turn_joint(log, joint))
+        fit_of(arm, reverse_joint(log, joint))
     markers = log_of("end_effector", 8)
     with pytest.raises(ConfigurationError, match=r"a sign is wrong \(joint elbow\)"):
-        fit_arm(model_of(turn_joint(markers, "elbow")))
+        fit_arm(model_of(reverse_joint(markers, "elbow")))
 
 
 def test_soft_springs_are_identified() -> None:
@@ -911,7 +918,7 @@ def test_held_out_errors_are_those_of_fits_that_did_not_see_the_poses(kind: Kind
     """Catches a fit that saw what it predicts, and a frame or a unit that is not the log's."""
     log = log_of(kind, 21, 40, friction=1.0, sides=True)
     parts = split(40, share=0.3, folds=1, seed=3)
-    held_out = judge(Judged.of_poses(model_of(log)), parts, 3, lambda done: None)
+    held_out = judge(HoldoutProblem.from_poses(model_of(log)), parts, 3, lambda done: None)
     errors = {error.name: error.rms for error in held_out.errors}
     assert list(errors) == [RIGID, *RIVALS, FITTED]
     assert (held_out.poses, held_out.held_out) == (28, 12)
@@ -928,7 +935,7 @@ def test_the_rigid_error_is_that_of_the_model_as_given() -> None:
     part = split(40, share=0.3, folds=1, seed=3)
     for kind in ("link_encoders", "torques"):
         log = log_of(kind, 22, 40)
-        held_out = judge(Judged.of_poses(model_of(log)), part, 3, lambda done: None)
+        held_out = judge(HoldoutProblem.from_poses(model_of(log)), part, 3, lambda done: None)
         rigid = log.theta if kind == "link_encoders" else model_of(log).arm.torque(log.theta)
         scale = 1e3 if kind == "link_encoders" else 1.0
         missed = scale * (log.measured - rigid)[part[0]]
@@ -940,7 +947,7 @@ def test_a_log_of_too_few_poses_is_fitted_whole() -> None:
     """Catches an identification that is refused for the sake of its judgement."""
     said = io.StringIO()
     console = Console(file=said, width=200)
-    judged = Judged.of_poses(model_of(log_of("link_encoders", 23, 20)))
+    judged = HoldoutProblem.from_poses(model_of(log_of("link_encoders", 23, 20)))
     assert judge_poses(judged, HoldoutOptions(), console, seed=0) is None
     assert said.getvalue().startswith(
         "nothing is held out: 20 poses leave 14 to fit and 6 to hold out"

@@ -7,25 +7,21 @@ import mujoco
 import numpy as np
 import pytest
 
-from baselines.identification.geometry_fit import (
-    QUANTILE,
-    GeometryProblem,
-    fit_geometry,
-)
-from baselines.identification.geometry_model import AxialTorques, GeometryModel, Parameters
+from baselines.identification.geometry_fit import QUANTILE, fit_geometry
+from baselines.identification.geometry_gradient import marker_gradient
+from baselines.identification.geometry_model import AxialTorques, GeometryModel, GeometryParameters
+from baselines.identification.geometry_problem import GeometryProblem
 from baselines.identification.geometry_result import correct_model, describe_geometry
 from baselines.identification.holdout import (
     FITTED,
     HeldOut,
     HeldOutError,
-    Judged,
+    HoldoutProblem,
     judge,
-    predict_by_kernel,
-    predict_constant,
-    predict_linear,
     split,
 )
 from baselines.identification.pose_log import PoseLog, read_log, write_poses
+from baselines.identification.rivals import predict_by_kernel, predict_constant, predict_linear
 from elastic_env.core.errors import ConfigurationError, ElasticError
 from elastic_env.core.signals import Array
 from elastic_env.core.yaml_text import parse_yaml
@@ -66,7 +62,7 @@ def tree(model: mujoco.MjModel) -> Tree:
 @pytest.fixture(scope="module")
 def geometry(model: mujoco.MjModel, tree: Tree) -> GeometryModel:
     places = [(name, int(model.site(name).bodyid[0]), model.site(name).pos) for name in SITES]
-    return GeometryModel.of(tree, JOINTS, model.opt.gravity, places)
+    return GeometryModel.from_tree(tree, JOINTS, model.opt.gravity, places)
 
 
 def draw(seed: int, count: int = 6) -> tuple[np.random.Generator, Array]:
@@ -75,9 +71,9 @@ def draw(seed: int, count: int = 6) -> tuple[np.random.Generator, Array]:
     return generator, generator.uniform(-1.2, 1.2, (count, len(JOINTS)))
 
 
-def some_parameters(generator: np.random.Generator) -> Parameters:
+def some_parameters(generator: np.random.Generator) -> GeometryParameters:
     """Parameters far from nominal ones, with deflections of a tenth of a radian."""
-    return Parameters(
+    return GeometryParameters(
         translation=0.1 * generator.standard_normal(3),
         rotation=0.3 * generator.standard_normal(3),
         marker=0.05 * generator.standard_normal((2, 3)),
@@ -118,7 +114,7 @@ def test_derivatives_are_difference_quotients(
     """Catches a moment that does not change with a parameter, and a twist about a wrong point."""
     generator, q = draw(1)
     parameters = some_parameters(generator)
-    shown, gradient = geometry.gradient(parameters, q, axial)
+    shown, gradient = marker_gradient(geometry, parameters, q, axial)
     np.testing.assert_array_equal(shown, geometry.predict_markers(parameters, q, axial))
     for kind, values in parameters._asdict().items():
         step = {"compliance": 1e-8, "friction": 1e-4}.get(kind, 1e-6)
@@ -206,7 +202,6 @@ def test_the_corrected_model_is_the_identified_arm(
         geometry,
         theta,
         geometry.predict_markers(geometry.nominal_parameters(), theta),
-        JOINTS,
         "full",
     )
     x = problem.unknowns.prior * generator.standard_normal(len(problem.unknowns.prior))
@@ -229,7 +224,7 @@ def made_up(
     """Poses of an arm whose parameters are drawn from their priors, and those parameters."""
     generator, theta = draw(seed, count)
     blank = np.zeros((count, len(SITES), 3))
-    problem = GeometryProblem(arm, theta, blank, JOINTS, elastic=JOINTS, **options)  # type: ignore[arg-type]
+    problem = GeometryProblem(arm, theta, blank, elastic=JOINTS, **options)  # type: ignore[arg-type]
     prior = problem.unknowns.prior
     truth = prior * generator.standard_normal(len(prior))
     kinds = np.array(problem.unknowns.kinds)
@@ -239,7 +234,7 @@ def made_up(
     truth[own] = prior[own] * generator.uniform(0.1, 0.6, len(own))
     shown = arm.predict_markers(problem.parameters(truth), theta, problem.axial)
     measured = shown + noise_m * generator.standard_normal(blank.shape)
-    return GeometryProblem(arm, theta, measured, JOINTS, elastic=JOINTS, **options), truth  # type: ignore[arg-type]
+    return GeometryProblem(arm, theta, measured, elastic=JOINTS, **options), truth  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
@@ -282,7 +277,7 @@ def test_friction_of_known_sides_is_told_apart_from_stiffness() -> None:
         fit = fit_geometry(arm_with_friction(seed))
         found = {(own.kind, own.name): own for own in fit.estimates}
         for kind, truth in truths.items():
-            for joint, value in zip(fit.problem.joints, truth, strict=True):
+            for joint, value in zip(fit.problem.model.joints, truth, strict=True):
                 own = found[kind, joint]
                 if own.is_told:
                     held.append(abs(own.value - value) < own.half_width)
@@ -299,7 +294,7 @@ def test_sides_of_approach_lower_the_noise() -> None:
     fit = fit_geometry(problem)
     assert fit.noise_m < 0.6 * blind.noise_m
     found = {own.name: own for own in fit.estimates if own.kind == "friction"}
-    for joint, truth in zip(problem.joints, test_arm_identification.FRICTION, strict=True):
+    for joint, truth in zip(problem.model.joints, test_arm_identification.FRICTION, strict=True):
         assert abs(found[joint].value - truth) < 4.0 * found[joint].half_width / QUANTILE
     assert found["elbow"].is_told
 
@@ -323,8 +318,10 @@ def test_masses_that_are_guessed_hardly_matter(geometry: GeometryModel) -> None:
         scaled = replace(
             geometry, weight=scale * geometry.weight, weight_moment=scale * geometry.weight_moment
         )
-        own = GeometryProblem(scaled, problem.theta, problem.measured, JOINTS, "dh", JOINTS)
-        errors.append(judge(Judged.of_geometry(own), parts, 0, lambda done: None).errors[-1].rms)
+        own = GeometryProblem(scaled, problem.theta, problem.measured, "dh", JOINTS)
+        errors.append(
+            judge(HoldoutProblem.from_geometry(own), parts, 0, lambda done: None).errors[-1].rms
+        )
     assert np.ptp(errors) < 0.1 * errors[1]
 
 
@@ -427,10 +424,10 @@ def test_too_few_poses_for_a_split_are_said(
     geometry: GeometryModel, count: int, folds: int, said: str
 ) -> None:
     """Catches an error of two poses that looks like evidence, and folds judged one by one."""
-    judged = Judged.of_geometry(made_up(geometry, 7, count=count, noise_m=3e-4)[0])
+    judged = HoldoutProblem.from_geometry(made_up(geometry, 7, count=count, noise_m=3e-4)[0])
     parts = split(count, share=0.3, folds=folds, seed=0)
-    assert judged.too_few(parts).startswith(said)
-    assert bool(judged.too_few(parts)) == bool(said)
+    assert judged.shortage(parts).startswith(said)
+    assert bool(judged.shortage(parts)) == bool(said)
 
 
 def test_the_tracker_is_aligned_before_the_fit(geometry: GeometryModel) -> None:
@@ -440,7 +437,7 @@ def test_the_tracker_is_aligned_before_the_fit(geometry: GeometryModel) -> None:
         rotation=np.array([0.0, 0.0, 3.0]), translation=np.array([1.0, -2.0, 0.5])
     )
     measured = geometry.predict_markers(turned, theta)
-    own = GeometryProblem(geometry, theta, measured, JOINTS).align().model
+    own = GeometryProblem(geometry, theta, measured).align().model
     shown = own.predict_markers(own.nominal_parameters(), theta)
     np.testing.assert_allclose(shown, measured, atol=1e-9)
 
@@ -487,7 +484,7 @@ def test_folds_hold_out_each_pose_once(geometry: GeometryModel) -> None:
     problem, _ = made_up(geometry, 8, count=40, noise_m=5e-4)
     parts = split(40, share=0.3, folds=4, seed=0)
     assert sorted(np.concatenate(parts)) == list(range(40))
-    held_out = judge(Judged.of_geometry(problem), parts, 0, lambda done: None)
+    held_out = judge(HoldoutProblem.from_geometry(problem), parts, 0, lambda done: None)
     assert held_out.held_out == 40
     assert held_out.is_ahead
     assert [point.poses for point in held_out.curve] == [15, 30]

@@ -664,10 +664,10 @@ def test_the_log_is_one_that_identify_reads(tmp_path: Path) -> None:
     assert [one.name for one in files] == [f"servo_{name}.csv" for name in NAMES[1:4]]
     read = read_servo_log(files[1], joint="elbow_flex")
     assert len(read) == len(states)
-    assert read.known is not None
+    assert read.known_torque is not None
     weight = RigidBody(MODEL, NAMES).gravity_torque(states[-1].theta)
-    np.testing.assert_allclose(read.known[-1], -weight[2], rtol=1e-3)
-    assert np.sign(states[-1].torque[2]) == -np.sign(read.known[-1])
+    np.testing.assert_allclose(read.known_torque[-1], -weight[2], rtol=1e-3)
+    assert np.sign(states[-1].torque[2]) == -np.sign(read.known_torque[-1])
 
 
 def logged(folder: Path, commands: Any, poses: Array) -> tuple[list[ArmState], list[Path]]:

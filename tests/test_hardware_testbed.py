@@ -36,7 +36,7 @@ from tests.emulators import wait_until_rest
 from tests.hardware_trials import trials as hardware_trials
 from tests.hardware_trials.__main__ import prove
 from train.commands.cli import main
-from train.commands.identify import Identify, OfTestbed, identified_environments
+from train.commands.identify import Identify, JointOptions, identified_environments
 from train.commands.options import OnHardware
 
 QUICK = {"kind": "sine", "amplitude": 0.1, "frequency_hz": 0.5, "duration_s": 0.3, "onset_s": 0.4}
@@ -381,7 +381,7 @@ def test_identification_takes_the_pendulum_that_is_mounted(tmp_path: Path) -> No
         "port: /dev/a\nimu_port: /dev/b\npendulum: {gravity_torque: 52.0, mass: 8.0}\n"
     )
     on = OnHardware(mounting=tmp_path / "m.yaml")
-    envs = identified_environments(Identify(on=on, testbed=OfTestbed(second_mass=0.5)))
+    envs = identified_environments(Identify(on=on, testbed=JointOptions(second_mass=0.5)))
     pendulums = [env.unwrapped.task.config.pendulum for env in envs]
     assert [(p.gravity_torque, p.mass) for p in pendulums] == [(52.0, 8.0), (26.0, 4.0)]
 

@@ -11,14 +11,9 @@ import pytest
 
 import baselines.identification.identify as identification
 from baselines.compensation.gravity_torque import GravityModel, make_gravity
-from baselines.identification.identify import (
-    HoldRecorder,
-    Identification,
-    StaticPoints,
-    identify,
-    identify_points,
-    record_points,
-)
+from baselines.identification.identify import Identification, identify, identify_points
+from baselines.identification.point_regression import fit_points
+from baselines.identification.static_points import HoldRecorder, StaticPoints, record_points
 from elastic_env.core.errors import ConfigurationError, ElasticError
 from elastic_env.core.signals import Array
 from elastic_env.joint.dynamixel import H54_200_S500_R
@@ -198,7 +193,7 @@ def test_residual_spread_is_that_of_the_noise() -> None:
     are left."""
     generator = np.random.default_rng(2)
     spreads = [
-        identification.fit_points(points, points.q, G * np.sin(points.q), with_sine_error=False)
+        fit_points(points, points.q, G * np.sin(points.q), with_sine_error=False)
         for points in (
             synthetic(positions=6, noise=generator.normal(0.0, 1e-4, 12)) for _ in range(300)
         )
@@ -206,7 +201,7 @@ def test_residual_spread_is_that_of_the_noise() -> None:
     variance = np.mean([np.sum(fit.residuals**2) / (12 - 4) for fit in spreads])
     assert np.sqrt(variance) == REST(1e-4, rel=0.06)
     points = synthetic(positions=6, noise=generator.normal(0.0, 1e-4, 12))
-    fit = identification.fit_points(points, points.q, G * np.sin(points.q), with_sine_error=False)
+    fit = fit_points(points, points.q, G * np.sin(points.q), with_sine_error=False)
     result = identify_points(points, gravity())
     assert result.residual_rad == REST(np.sqrt(np.sum(fit.residuals**2) / 8), rel=0.01)
 

@@ -157,14 +157,16 @@ def test_the_known_torque_is_that_of_weight_and_of_the_other_joints(tmp_path: Pa
         mujoco.mj_fullM(model, data, matrix)
     for joint, log in enumerate(logs):
         assert log.load.inertia is not None
-        assert log.known is not None
+        assert log.known_torque is not None
         dof = model.joint(BODY[joint]).dofadr[0]
         own = np.mean(matrices[:, dof, dof]) - model.dof_armature[dof]
         assert log.load.inertia == pytest.approx(own, rel=0.01)
         expected = log.load.inertia * q_ddot - body.inverse_dynamics(q, q_dot, q_ddot)
         expected = expected[:, joint]
         largest = np.abs(expected).max()
-        np.testing.assert_allclose(log.known[inside], expected[inside], atol=0.01 * largest + 2e-4)
+        np.testing.assert_allclose(
+            log.known_torque[inside], expected[inside], atol=0.01 * largest + 2e-4
+        )
         np.testing.assert_allclose(log.position, q[:, joint], atol=1e-6)
 
 
@@ -184,9 +186,9 @@ def test_the_command_writes_logs_that_identify_reads(
     turn = np.deg2rad(4095 / 4096)
     np.testing.assert_allclose(log.goal, turn * (goal[:, 2] + 1.0), atol=1e-6)
     np.testing.assert_allclose(log.position, turn * position[:, 2], atol=1e-6)
-    assert log.known is not None
+    assert log.known_torque is not None
     # the servo has to lift the load: where the link is pulled forward, its goal is behind
-    assert log.known.shape == log.position.shape
+    assert log.known_torque.shape == log.position.shape
 
 
 @pytest.mark.parametrize(

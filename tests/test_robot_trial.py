@@ -22,14 +22,8 @@ from elastic_env.robots.robot.environment import EXAMPLE, configure_robot
 from elastic_env.world.joint_task import JointPlant
 from tests.gallery_files import FOLDER
 from train.commands.cli import main
-from train.commands.robot import (
-    POLICIES,
-    Robot,
-    joint_shares,
-    rest_poses,
-    robot_arguments,
-    try_robot,
-)
+from train.commands.robot import POLICIES, Robot, robot_arguments, try_robot
+from train.commands.robot_at_rest import joint_shares, rest_poses
 from train.evaluate.conditions import Condition
 from train.evaluate.environments import environment
 from train.evaluate.episodes import Evaluation, evaluate

@@ -13,7 +13,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rich.console import Console
 
-from baselines.identification import servo_fit
 from baselines.identification.servo_file import AngleUnit
 from baselines.identification.servo_fit import ServoFit, fit_servo
 from baselines.identification.servo_holdout import (
@@ -23,9 +22,10 @@ from baselines.identification.servo_holdout import (
     ServoHoldout,
     judge_servo,
 )
+from baselines.identification.servo_intervals import cluster_variance
 from baselines.identification.servo_load import GRAVITY, Load
 from baselines.identification.servo_log import ServoLog, read_servo_log
-from baselines.identification.servo_problem import drive, duty_per_torque_gain
+from baselines.identification.servo_problem import find_limit_per_gain
 from baselines.identification.servo_replay import NAMES, Replay
 from baselines.identification.servo_result import ServoIdentification, describe_servo
 from docs.pages.recorded import priors
@@ -63,7 +63,7 @@ def test_free_swing_has_the_period_and_the_decay_of_a_damped_pendulum() -> None:
     inertia = MASS_KG * LENGTH_M**2 + 1e-3
     damping = 2e-3
     log = log_of(np.zeros(600), start=0.01, on=False)
-    played = Replay.of(log).play(parameters(rotor_inertia=1e-3, viscous_friction=damping))
+    played = Replay.from_log(log).play(parameters(rotor_inertia=1e-3, viscous_friction=damping))
     rate = damping / (2.0 * inertia)
     omega = np.sqrt(WEIGHT / inertia - rate**2)
     t = log.time
@@ -75,7 +75,7 @@ def test_free_swing_loses_what_dry_friction_takes() -> None:
     """Each half swing of a spring-like load loses 2 F / (m g l)."""
     log = log_of(np.zeros(400), start=0.05, on=False)
     friction = 0.01 * WEIGHT / 2.0
-    played = Replay.of(log).play(parameters(rotor_inertia=1e-3, coulomb_friction=friction))
+    played = Replay.from_log(log).play(parameters(rotor_inertia=1e-3, coulomb_friction=friction))
     swings = np.abs(played[1:-1][np.diff(np.sign(np.diff(played))) != 0])
     np.testing.assert_allclose(swings[:3], 0.05 - 0.01 * np.arange(1, 4), atol=1e-4)
 
@@ -92,7 +92,7 @@ def test_friction_with_the_load_holds_a_band_and_drives_at_its_edges() -> None:
         load_friction=c,
     )
     log = log_of(ramp)
-    q = Replay.of(log).play(own)
+    q = Replay.from_log(log).play(own)
     w = np.gradient(q, log.time)
     pull = gain * (ramp - q) - 0.02 * w
     for rows, side in ((slice(2000, 3900), 1.0), (slice(6500, 8000), -1.0)):
@@ -110,9 +110,9 @@ def test_replay_without_friction_agrees_with_mujoco() -> None:
     <inertial pos="0 0 -{LENGTH_M}" mass="{MASS_KG}" diaginertia="1e-12 1e-12 1e-12"/></body>
     </worldbody><actuator><position joint="j" kp="1.5" forcerange="-.6 .6"/></actuator></mujoco>"""
     model = mujoco.MjModel.from_xml_string(xml)
-    assert Load.of_joint(model, "j").torque == pytest.approx(WEIGHT)
-    assert Load.of_joint(model, "j").inertia == pytest.approx(MASS_KG * LENGTH_M**2)
-    assert Load.of_joint(model, "j").rest == pytest.approx(0.0, abs=1e-9)
+    assert Load.from_model(model, "j").torque == pytest.approx(WEIGHT)
+    assert Load.from_model(model, "j").inertia == pytest.approx(MASS_KG * LENGTH_M**2)
+    assert Load.from_model(model, "j").rest == pytest.approx(0.0, abs=1e-9)
     data = mujoco.MjData(model)
     goal = 0.8 * np.sin(3.0 * 5e-3 * np.arange(600))
     log = log_of(goal)
@@ -125,7 +125,7 @@ def test_replay_without_friction_agrees_with_mujoco() -> None:
     own = parameters(
         position_gain=1.5, torque_limit=0.6, viscous_friction=0.03, rotor_inertia=0.002
     )
-    np.testing.assert_allclose(Replay.of(log).play(own), expected, atol=2e-4)
+    np.testing.assert_allclose(Replay.from_log(log).play(own), expected, atol=2e-4)
 
 
 def test_the_other_joints_of_a_robot_stand_where_its_keyframe_has_them() -> None:
@@ -135,7 +135,7 @@ def test_the_other_joints_of_a_robot_stand_where_its_keyframe_has_them() -> None
     <body><joint name="shoulder" axis="0 1 0"/>{link}<body pos="0 0 -0.2">
     <joint name="elbow" axis="0 1 0"/>{link}</body></body></worldbody>
     <keyframe><key qpos="0.5 0"/></keyframe></mujoco>""")
-    assert Load.of_joint(model, "elbow").rest == pytest.approx(-0.5)
+    assert Load.from_model(model, "elbow").rest == pytest.approx(-0.5)
 
 
 @settings(max_examples=30, deadline=None)
@@ -144,7 +144,7 @@ def test_no_torque_no_goal_gains_energy(start: float, c: float, F: float, Fs: fl
     """Without torque the pendulum never rises above its start, and friction holds it for ever."""
     angle = min(start, 3.0)
     log = log_of(np.zeros(300), start=angle, on=False)
-    q = Replay.of(log).play(
+    q = Replay.from_log(log).play(
         parameters(rotor_inertia=1e-3, load_friction=c, coulomb_friction=F, static_friction=Fs)
     )
     height = 1.0 - np.cos(q)
@@ -529,8 +529,8 @@ def test_pwm_at_its_limit_tells_the_torque_limit() -> None:
         for log in logs
     ]
     logged = [replace(log, pwm=duty) for log, duty in zip(logs, duties, strict=True)]
-    assert duty_per_torque_gain(logged) == pytest.approx(limit / gain, rel=1e-6)
-    assert duty_per_torque_gain(logs) is None
+    assert find_limit_per_gain(logged) == pytest.approx(limit / gain, rel=1e-6)
+    assert find_limit_per_gain(logs) is None
 
 
 def test_the_start_limits_the_torque_where_the_replay_does() -> None:
@@ -538,7 +538,7 @@ def test_the_start_limits_the_torque_where_the_replay_does() -> None:
     _, logs = short_logs(5)
     log = replace(logs[0], supply=12.0)
     duty = 0.4 * log.gain * float(np.abs(log.goal - log.position).max())
-    torque = 1e-3 * drive(log, duty)
+    torque = 1e-3 * log.torque_per_gain(duty)
     pull = 1e-3 * log.supply * log.gain * (log.goal - log.position)
     limit = 1e-3 * duty * log.supply
     np.testing.assert_allclose(torque, np.clip(pull, -limit, limit) * log.enabled)
@@ -552,7 +552,7 @@ def test_a_parameter_without_influence_has_no_interval() -> None:
     block = np.arange(100) // 10
     r = rng.normal(size=100)
     J = np.column_stack([one[:, 0], np.zeros(100), one[:, 1], one[:, 2], 2.0 * one[:, 2]])
-    told = np.isfinite(servo_fit._variance(J, r, block))
+    told = np.isfinite(cluster_variance(J, r, block))
     assert told.tolist() == [True, False, True, False, False]
 
 
@@ -797,9 +797,9 @@ def test_a_torque_that_is_switched_before_its_row_is_replayed_so() -> None:
     played = {}
     for share in (0.0, 0.5, 1.0):
         own[lead] = share * 0.02
-        played[share] = Replay.of(late).play(own)
+        played[share] = Replay.from_log(late).play(own)
     own[lead] = 0.0
-    np.testing.assert_allclose(played[1.0], Replay.of(early).play(own), atol=1e-12)
+    np.testing.assert_allclose(played[1.0], Replay.from_log(early).play(own), atol=1e-12)
     fallen = {share: played[share][19] - played[share][20] for share in played}
     assert fallen[0.0] == pytest.approx(0.0, abs=1e-6)
     assert fallen[0.5] == pytest.approx(fallen[1.0] / 4.0, rel=0.1)
@@ -855,7 +855,7 @@ def _recording(path: Path, motor: str, gain: float, name: str) -> None:
         load_friction=0.3,
         coulomb_friction=0.01,
     )
-    q = Replay.of(log).play(own)
+    q = Replay.from_log(log).play(own)
     entries = [
         {"timestamp": t, "position": a, "goal_position": g, "torque_enable": bool(e)}
         for t, a, g, e in zip(time.tolist(), q.tolist(), swing.tolist(), on.tolist(), strict=True)

@@ -1,1 +1,1 @@
-"""Stiffness, friction and offset of a joint from static positions."""
+"""Parameters of elastic joints, arms, their geometry and servos from measurements."""

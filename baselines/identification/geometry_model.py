@@ -1,4 +1,4 @@
-r"""Where markers on a tree of joints are, as a function of geometry, encoders and compliance.
+"""Places of markers on a tree of joints by geometry, encoders and compliance.
 
 The nominal model has a frame for each hinge, whose z axis is the hinge's axis. A real arm differs:
 
@@ -10,16 +10,12 @@ The nominal model has a frame for each hinge, whose z axis is the hinge's axis. 
   bearings and links that bend [Tenhumberg2023];
 * dry friction on the link holds a joint back from the side d = ±1 of its approach, and further
   torques may be known: m_z has −F d and τ_known besides the weight, as in `pose_model`;
-* a tracker shows R p + t of the places p of markers, which are not exactly known either.
+* a tracker measures R p + t of the places p of markers, which are not exactly known either.
 
 With `dh` each frame has the four parameters of Denavit and Hartenberg: a length and an angle about
 the common normal of its axis and that of the parent, a length along its own axis, and the encoder's
-offset. `full` has all three lengths and both angles across the axis.
-
-Derivatives are exact. Each parameter is a twist of all that lies beyond a joint: an axis, and a
-velocity at the anchor. It moves markers, and it moves weights, whose moments turn the joints anew:
-
-.. math:: (1 - c \, \partial m/\partial\varphi) \, d\varphi = m \, dc + c \, dm
+offset. `full` has all three lengths and both angles across the axis. `geometry_gradient` has the
+derivatives.
 
 [Tenhumberg2023] J. Tenhumberg, B. Bäuml, "Calibration of an Elastic Humanoid Upper Body and
 Efficient Compensation for Motion Planning", IEEE-RAS Humanoids.
@@ -31,23 +27,23 @@ from functools import cached_property
 from typing import Literal, NamedTuple, Self
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
+from baselines.identification.rotations import rotation_about_z, rotation_of
 from elastic_env.core.errors import ElasticError
 from elastic_env.core.signals import Array, BoolArray, IntArray
 from elastic_env.rigid.tree.links import Tree
 
 Geometry = Literal["offsets", "dh", "full"]
-"""What is unknown of the geometry besides markers and tracker: the encoders' offsets; also the
-parameters of Denavit and Hartenberg; or all lengths and angles.
+"""Unknown geometry besides markers and tracker: the encoders' offsets; also the parameters of
+Denavit and Hartenberg; or all lengths and angles.
 """
 
 _MOST_ITERATIONS = 600
 _LAST_STEP_RAD = 1e-12
-_FARTHEST_RAD = 1.0
-"""Deflection beyond which none is looked for."""
+_LARGEST_CHANGE_RAD = 1.0
+"""Change of a deflection in one iteration from which on the iteration diverges."""
 _PARALLEL = 1e-6
-_SMALL_RAD = 1e-6
+"""Length of a cross product below which two axes count as parallel."""
 
 
 @dataclass(frozen=True)
@@ -65,15 +61,15 @@ class Marker:
     place: Array
 
 
-class Parameters(NamedTuple):
+class GeometryParameters(NamedTuple):
     """Values of all parameters, by kind.
 
     Attributes:
         translation, rotation: Frame of the tracker, (3,) [m] and a rotation vector (3,) [rad].
         marker: Displacement of the markers from their nominal places, (k, 3) [m].
-        offset: Of the encoders, (n,) [rad].
+        offset: Offsets of the encoders, (n,) [rad].
         length: v of each joint, in the axes of its nominal frame, (n, 3) [m].
-        angle: ω of each joint, likewise, (n, 3) [rad].
+        angle: ω of each joint, in the same axes, (n, 3) [rad].
         compliance: c about the axes of each housing, (n, 3) [rad/(N·m)]; 1/K is the last one.
         friction: F of each joint, (n,) [N·m].
     """
@@ -89,19 +85,20 @@ class Parameters(NamedTuple):
 
 
 class AxialTorques(NamedTuple):
-    """What acts about the joints' own axes beside the weight, n joints and N poses.
+    """Friction and known torques about the joints' own axes, n joints and N poses.
 
     Attributes:
         direction: Side of approach, (N, n): +1 from below, −1 from above, 0 unknown [1].
-        known: Known further torque, (N, n) [N·m], positive where it turns the joint forward.
+        known_torque: Known torque besides the weight, (N, n) [N·m], positive where it turns the
+            joint forward.
     """
 
     direction: Array
-    known: Array
+    known_torque: Array
 
-    def of_poses(self, chosen: IntArray) -> "AxialTorques":
-        """Those of some of the poses."""
-        return AxialTorques(self.direction[chosen], self.known[chosen])
+    def part(self, poses: IntArray) -> "AxialTorques":
+        """Torques of some of the poses."""
+        return AxialTorques(self.direction[poses], self.known_torque[poses])
 
 
 class Posture(NamedTuple):
@@ -109,8 +106,8 @@ class Posture(NamedTuple):
 
     Attributes:
         housing: Axes of each joint before it turns, (n, N, 3, 3).
-        link: The same after, (n, N, 3, 3).
-        anchor: (n, N, 3) [m].
+        link: Axes of each joint after it has turned, (n, N, 3, 3).
+        anchor: Point on the axis of each joint, (n, N, 3) [m].
         lever: First moment of the weight beyond each joint about its anchor, (n, N, 3) [N·m].
         marker: Places of the markers, (N, k, 3) [m].
     """
@@ -122,22 +119,6 @@ class Posture(NamedTuple):
     marker: Array
 
 
-class Twists(NamedTuple):
-    """Small motions of all that lies beyond joints, P of them.
-
-    Attributes:
-        joint: (P,).
-        axis: Angular velocity, (N, P, 3).
-        velocity: Of the joint's anchor, (N, P, 3).
-        turns_housing: Whether the joint's own housing turns too, (P,).
-    """
-
-    joint: IntArray
-    axis: Array
-    velocity: Array
-    turns_housing: BoolArray
-
-
 @dataclass(frozen=True, eq=False)
 class GeometryModel:
     """Markers as a function of parameters, at given motor encoders.
@@ -145,22 +126,22 @@ class GeometryModel:
     Attributes:
         joints: Names of the joints, (n,).
         parent: Joint before each joint, -1 for the base; parents come before their children, (n,).
-        nominal: Frames in those of the parents where the joints are drawn, (n, 3, 3).
+        nominal: Frames in the frames of the parents at the reference angles, (n, 3, 3).
         anchor: Anchors in the frames of the parents, (n, 3) [m].
-        drawn: Joint angles where the model is drawn, (n,) [rad].
-        weight: Of the link behind each joint, (n,) [N].
+        reference: Reference angles of the joints, at which the model is drawn, (n,) [rad].
+        weight: Weight of the link behind each joint, (n,) [N].
         weight_moment: Its first moment about the anchor, in the link's frame, (n, 3) [N·m].
         down: Direction of gravity in the base, (3,).
-        markers: Those that the tracker sees.
-        alignment, origin: Rotation from base to tracker to begin with, (3, 3), and where the base
-            is, (3,) [m].
+        markers: Markers that the tracker measures.
+        alignment, origin: First rotation from base to tracker, (3, 3), and first place of the base,
+            (3,) [m].
     """
 
     joints: tuple[str, ...]
     parent: IntArray
     nominal: Array
     anchor: Array
-    drawn: Array
+    reference: Array
     weight: Array
     weight_moment: Array
     down: Array
@@ -169,14 +150,14 @@ class GeometryModel:
     origin: Array
 
     @classmethod
-    def of(
+    def from_tree(
         cls,
         tree: Tree,
         joints: Sequence[str],
         gravity: Array,
         markers: Sequence[tuple[str, int, Array]],
     ) -> Self:
-        """Of the links of a rigid model.
+        """Model of the links of a rigid model.
 
         Args:
             tree: Links whose joints are in the model's order.
@@ -186,7 +167,7 @@ class GeometryModel:
         """
         links = tree.links[1:]
         size = float(np.linalg.norm(gravity))
-        seen = [
+        on_joints = [
             Marker(name, tree.carrier[body] - 1, tree.place[body] + tree.R[body] @ place)
             for name, body, place in markers
         ]
@@ -195,11 +176,11 @@ class GeometryModel:
             parent=links["parent"] - 1,
             nominal=links["R"],
             anchor=links["anchor"],
-            drawn=links["zero"],
+            reference=links["zero"],
             weight=size * links["weight"],
             weight_moment=size * links["weight_moment"],
             down=gravity / size,
-            markers=tuple(seen),
+            markers=tuple(on_joints),
             alignment=np.eye(3),
             origin=np.zeros(3),
         )
@@ -222,13 +203,13 @@ class GeometryModel:
     def normals(self) -> Array:
         """Unit vectors across each axis in its nominal frame, (n, 2, 3).
 
-        The first one is the common normal of the axis and that of the parent, whose axis counts as
+        The first one is the common normal of the axis and the parent's axis, which counts as
         vertical for the first joint. The second one completes a frame with the axis.
         """
         normals = np.empty((self.num_joints, 2, 3))
         for j in range(self.num_joints):
-            before = self.nominal[j].T @ np.array([0.0, 0.0, 1.0])
-            normal = np.cross(before, [0.0, 0.0, 1.0])
+            parent_axis = self.nominal[j].T @ np.array([0.0, 0.0, 1.0])
+            normal = np.cross(parent_axis, [0.0, 0.0, 1.0])
             if np.linalg.norm(normal) < _PARALLEL:
                 normal = self.nominal[j].T @ self.anchor[j] * [1.0, 1.0, 0.0]
             if np.linalg.norm(normal) < _PARALLEL:
@@ -237,10 +218,10 @@ class GeometryModel:
             normals[j, 1] = np.cross([0.0, 0.0, 1.0], normals[j, 0])
         return normals
 
-    def nominal_parameters(self) -> Parameters:
-        """Those of the rigid nominal model."""
+    def nominal_parameters(self) -> GeometryParameters:
+        """Parameters of the rigid nominal model."""
         n = self.num_joints
-        return Parameters(
+        return GeometryParameters(
             translation=np.zeros(3),
             rotation=np.zeros(3),
             marker=np.zeros((len(self.markers), 3)),
@@ -252,38 +233,38 @@ class GeometryModel:
         )
 
     def predict_markers(
-        self, parameters: Parameters, theta: Array, axial: AxialTorques | None = None
+        self, parameters: GeometryParameters, theta: Array, axial: AxialTorques | None = None
     ) -> Array:
-        """Places of the markers as the tracker shows them, (N, k, 3) [m], at motor encoders (N, n).
+        """Places of the markers in the tracker's frame, (N, k, 3) [m], at motor encoders (N, n).
 
         Raises:
             ElasticError: The load overcomes a joint.
         """
-        return self._shown(parameters, self.posture(parameters, theta, axial).marker)
+        return self.to_tracker(parameters, self.posture(parameters, theta, axial).marker)
 
     def posture(
-        self, parameters: Parameters, theta: Array, axial: AxialTorques | None = None
+        self, parameters: GeometryParameters, theta: Array, axial: AxialTorques | None = None
     ) -> Posture:
-        """The joints at rest, by iteration: each deflection from the moments at the last ones.
+        """The joints at rest, by iteration: deflections follow from the moments at the last ones.
 
         Args:
-            parameters: Of the arm.
+            parameters: Parameters of the arm.
             theta: Motor encoders, (N, n) [rad].
-            axial: What acts beside the weight; None for nothing.
+            axial: Torques besides the weight; None for none.
 
         Raises:
             ElasticError: The load overcomes a joint.
         """
-        angles = theta - parameters.offset - self.drawn
+        angles = theta - parameters.offset - self.reference
         turn = np.zeros((*angles.shape, 3))
         posture = self._place(parameters, angles, turn)
         if not parameters.compliance.any():
             return posture
         for _ in range(_MOST_ITERATIONS):
-            settled = parameters.compliance * self._loads(parameters, posture, axial)
-            change = np.abs(settled - turn).max()
-            turn = settled
-            if not change < _FARTHEST_RAD:
+            next_turn = parameters.compliance * self.loads(parameters, posture, axial)
+            change = np.abs(next_turn - turn).max()
+            turn = next_turn
+            if not change < _LARGEST_CHANGE_RAD:
                 break
             posture = self._place(parameters, angles, turn)
             if change < _LAST_STEP_RAD:
@@ -294,90 +275,25 @@ class GeometryModel:
             f" {parameters.compliance[worst].max():.3g} rad/(N·m): there is no posture at rest"
         )
 
-    def _loads(self, parameters: Parameters, posture: Posture, axial: AxialTorques | None) -> Array:
+    def loads(
+        self, parameters: GeometryParameters, posture: Posture, axial: AxialTorques | None
+    ) -> Array:
         """Moments that bend the joints, in the axes of the housings, (N, n, 3) [N·m]."""
         moments = self.moments(posture)
         if axial is not None:
-            moments[..., 2] += axial.known - parameters.friction * axial.direction
+            moments[..., 2] += axial.known_torque - parameters.friction * axial.direction
         return moments
 
-    def gradient(
-        self, parameters: Parameters, theta: Array, axial: AxialTorques | None = None
-    ) -> tuple[Array, Parameters]:
-        """Places of the markers, and their derivatives; arguments as `posture`.
-
-        Returns:
-            Measured, (N, k, 3) [m], and the derivatives (N, k, 3, ...) by each parameter.
-        """
-        posture = self.posture(parameters, theta, axial)
-        shown = self._shown(parameters, posture.marker)
-        R = self._tracker(parameters)
-        count = len(theta)
-        n = self.num_joints
-        k = len(self.markers)
-        loads = self._loads(parameters, posture, axial)
-        compliance = parameters.compliance
-        # deflections φ of all joints: 1 − c ∂m/∂φ, and the markers by them
-        housings = np.moveaxis(posture.housing, 0, 1)
-        axes = housings @ _left_jacobian(compliance * loads)
-        bending = self._about(axes, turns_housing=False)
-        stiff = np.eye(3 * n) - self._moment_change(posture, bending, compliance)
-        by_bending = self._marker_change(posture, bending)
-
-        def by_turns(turns: Array, direct: Array | float = 0.0) -> Array:
-            """Derivatives of the measurement by turns of the joints, (N, 3 n, P) [rad].
-
-            `direct` is what the markers move besides.
-            """
-            turned = np.linalg.solve(stiff, turns)
-            return R @ (direct + np.einsum("nkaq,nqp->nkap", by_bending, turned))
-
-        def by(twists: Twists) -> Array:
-            """Derivatives of the measurement by twists, (N, k, 3, P)."""
-            turns = self._moment_change(posture, twists, compliance)
-            return by_turns(turns, self._marker_change(posture, twists))
-
-        turning = Twists(
-            joint=np.arange(n),
-            axis=np.moveaxis(posture.link[..., 2], 0, 1),
-            velocity=np.zeros((count, n, 3)),
-            turns_housing=np.zeros(n, dtype=np.bool_),
-        )
-        frames = self._nominal_frames(posture)
-        tilting = self._about(frames @ _left_jacobian(parameters.angle))
-        along = self._about(frames)
-        along = along._replace(axis=along.velocity, velocity=along.axis)
-        own = np.zeros((count, 3 * n, 3 * n))
-        own[:, np.arange(3 * n), np.arange(3 * n)] = loads.reshape(count, 3 * n)
-        held = np.zeros((count, 3 * n, n))
-        if axial is not None:
-            by_friction = -compliance[:, 2] * axial.direction
-            held[:, np.arange(2, 3 * n, 3), np.arange(n)] = by_friction
-        of_marker = np.zeros((count, k, 3, k, 3))
-        for i, marker in enumerate(self.markers):
-            of_marker[:, i, :, i] = R @ (
-                np.eye(3) if marker.joint < 0 else posture.link[marker.joint]
-            )
-        return shown, Parameters(
-            translation=np.broadcast_to(np.eye(3), (count, k, 3, 3)),
-            rotation=-cross_matrix(shown - self.origin - parameters.translation)
-            @ _left_jacobian(parameters.rotation),
-            marker=of_marker,
-            offset=-by(turning),
-            length=by(along).reshape(count, k, 3, n, 3),
-            angle=by(tilting).reshape(count, k, 3, n, 3),
-            compliance=by_turns(own).reshape(count, k, 3, n, 3),
-            friction=np.zeros((count, k, 3, n)) if axial is None else by_turns(held),
-        )
-
-    def _tracker(self, parameters: Parameters) -> Array:
+    def tracker_rotation(self, parameters: GeometryParameters) -> Array:
         """Rotation from the base to the tracker, (3, 3)."""
         return rotation_of(parameters.rotation) @ self.alignment
 
-    def _shown(self, parameters: Parameters, marker: Array) -> Array:
-        return marker @ self._tracker(parameters).T + self.origin + parameters.translation
+    def to_tracker(self, parameters: GeometryParameters, places: Array) -> Array:
+        """Places in the tracker's frame, from the base, (..., 3) [m]."""
+        R = self.tracker_rotation(parameters)
+        return places @ R.T + self.origin + parameters.translation
 
-    def _place(self, parameters: Parameters, angles: Array, turn: Array) -> Posture:
+    def _place(self, parameters: GeometryParameters, angles: Array, turn: Array) -> Posture:
         """Frames at given angles of the joints, and deflections in the axes of the housings."""
         count, n = angles.shape
         housing = np.empty((n, count, 3, 3))
@@ -385,25 +301,25 @@ class GeometryModel:
         anchor = np.empty((n, count, 3))
         lever = np.empty((n, count, 3))
         errors = rotation_of(parameters.angle)
-        bent = rotation_of(turn)
+        deflections = rotation_of(turn)
         for j, parent in enumerate(self.parent):
             R = np.eye(3) if parent < 0 else link[parent]
             origin = np.zeros(3) if parent < 0 else anchor[parent]
             anchor[j] = origin + R @ (self.anchor[j] + self.nominal[j] @ parameters.length[j])
             housing[j] = R @ (self.nominal[j] @ errors[j])
-            link[j] = housing[j] @ bent[:, j] @ rotation_about_z(angles[:, j])
+            link[j] = housing[j] @ deflections[:, j] @ rotation_about_z(angles[:, j])
             lever[j] = link[j] @ self.weight_moment[j]
-        beyond = self.weight.copy()
+        carried_weight = self.weight.copy()
         for j in range(n - 1, -1, -1):
             parent = self.parent[j]
             if parent >= 0:
-                lever[parent] += lever[j] + beyond[j] * (anchor[j] - anchor[parent])
-                beyond[parent] += beyond[j]
+                lever[parent] += lever[j] + carried_weight[j] * (anchor[j] - anchor[parent])
+                carried_weight[parent] += carried_weight[j]
         places = [
-            np.broadcast_to(marker.place + moved, (count, 3))
+            np.broadcast_to(marker.place + shift, (count, 3))
             if marker.joint < 0
-            else anchor[marker.joint] + link[marker.joint] @ (marker.place + moved)
-            for marker, moved in zip(self.markers, parameters.marker, strict=True)
+            else anchor[marker.joint] + link[marker.joint] @ (marker.place + shift)
+            for marker, shift in zip(self.markers, parameters.marker, strict=True)
         ]
         return Posture(housing, link, anchor, lever, np.stack(places, axis=1))
 
@@ -411,89 +327,3 @@ class GeometryModel:
         """Moments of gravity about the anchors, in the axes of the housings, (N, n, 3) [N·m]."""
         moment = np.cross(posture.lever, self.down)
         return np.einsum("jnba,jnb->nja", posture.housing, moment)
-
-    def _nominal_frames(self, posture: Posture) -> Array:
-        """Axes of the nominal frames behind their parents' links, (N, n, 3, 3)."""
-        count = posture.link.shape[1]
-        parents = [
-            np.broadcast_to(np.eye(3), (count, 3, 3)) if parent < 0 else posture.link[parent]
-            for parent in self.parent
-        ]
-        return np.stack(parents, axis=1) @ self.nominal
-
-    def _about(self, frames: Array, turns_housing: bool = True) -> Twists:
-        """A turn of each joint about each axis of its frame, (N, n, 3, 3): 3 n twists."""
-        count, n = frames.shape[:2]
-        axis = frames.transpose(0, 1, 3, 2).reshape(count, 3 * n, 3)
-        return Twists(
-            joint=np.repeat(np.arange(n), 3),
-            axis=axis,
-            velocity=np.zeros_like(axis),
-            turns_housing=np.full(3 * n, turns_housing),
-        )
-
-    def _marker_change(self, posture: Posture, twists: Twists) -> Array:
-        """Velocities of the markers in the base, (N, k, 3, P)."""
-        changes = []
-        anchor = np.moveaxis(posture.anchor, 0, 1)[:, twists.joint]
-        for i, marker in enumerate(self.markers):
-            arm = posture.marker[:, i, None] - anchor
-            moved = np.cross(twists.axis, arm) + twists.velocity
-            carried = 0.0
-            if marker.joint >= 0:
-                carried = self.is_beyond[twists.joint, marker.joint]
-            changes.append(moved * np.reshape(carried, (-1, 1)))
-        return np.stack(changes, axis=1).transpose(0, 1, 3, 2)
-
-    def _moment_change(self, posture: Posture, twists: Twists, compliance: Array) -> Array:
-        """C times the change of the moments in the axes of the housings, (N, 3 n, P) [rad]."""
-        count = posture.link.shape[1]
-        changes = np.empty((self.num_joints, count, len(twists.joint), 3))
-        lever = np.moveaxis(posture.lever, 0, 1)
-        own_lever = lever[:, twists.joint]
-        own_weight = (self.is_beyond @ self.weight)[twists.joint, None]
-        of_outer = np.cross(twists.axis, own_lever) + own_weight * twists.velocity
-        for j in range(self.num_joints):
-            # the twist moves joint j itself, or weight beyond it
-            carries = self.is_beyond[twists.joint, j][:, None]
-            is_inner = self.is_beyond[j, twists.joint][:, None]
-            of_inner = np.cross(twists.axis, lever[:, j, None])
-            change = np.where(carries, of_inner, np.where(is_inner, of_outer, 0.0))
-            moment = np.cross(change, self.down)
-            turns = carries & ((twists.joint != j) | twists.turns_housing)[:, None]
-            own = np.cross(posture.lever[j], self.down)[:, None]
-            moment = moment - np.where(turns, np.cross(twists.axis, own), 0.0)
-            changes[j] = moment @ posture.housing[j]
-        stacked = changes.transpose(1, 0, 3, 2).reshape(count, 3 * self.num_joints, -1)
-        return compliance.reshape(-1, 1) * stacked
-
-
-def rotation_of(vectors: Array) -> Array:
-    """Rotations by rotation vectors, (..., 3) [rad] to (..., 3, 3)."""
-    flat = Rotation.from_rotvec(np.reshape(vectors, (-1, 3))).as_matrix()
-    return flat.reshape(*np.shape(vectors)[:-1], 3, 3)
-
-
-def rotation_about_z(angles: Array) -> Array:
-    """Rotations about z, (N,) [rad] to (N, 3, 3)."""
-    R = np.zeros((len(angles), 3, 3))
-    R[:, 0, 0] = R[:, 1, 1] = np.cos(angles)
-    R[:, 1, 0] = np.sin(angles)
-    R[:, 0, 1] = -R[:, 1, 0]
-    R[:, 2, 2] = 1.0
-    return R
-
-
-def _left_jacobian(vectors: Array) -> Array:
-    """Angular velocity by the rate of a rotation vector, (..., 3) to (..., 3, 3)."""
-    angle = np.linalg.norm(vectors, axis=-1)[..., None, None]
-    safe = np.where(angle < _SMALL_RAD, 1.0, angle)
-    W = cross_matrix(vectors)
-    first = np.where(angle < _SMALL_RAD, 0.5, (1.0 - np.cos(safe)) / safe**2)
-    second = np.where(angle < _SMALL_RAD, 1.0 / 6.0, (safe - np.sin(safe)) / safe**3)
-    return np.eye(3) + first * W + second * (W @ W)
-
-
-def cross_matrix(vectors: Array) -> Array:
-    """Matrices of the cross product with vectors from the left, (..., 3) to (..., 3, 3)."""
-    return np.cross(np.eye(3), np.expand_dims(vectors, -2))

@@ -7,12 +7,17 @@ import mujoco
 from pydantic import Field
 
 from baselines.identification.geometry_fit import GeometryEstimate, GeometryFit
-from baselines.identification.geometry_model import Geometry, rotation_of
+from baselines.identification.geometry_model import Geometry
 from baselines.identification.holdout import HeldOut
+from baselines.identification.result_files import (
+    save_result,
+    stiffness_interval,
+    stiffness_line,
+)
+from baselines.identification.rotations import rotation_of
 from elastic_env.core.config import Model
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.rotations import matrix_of, quaternion_of
-from elastic_env.core.yaml_text import yaml_line
 from elastic_env.rigid.tree.links import Tree
 
 
@@ -43,7 +48,7 @@ class GeometryIdentification(Model):
 
     @property
     def prior_parameters(self) -> tuple[str, ...]:
-        """Parameters of which the poses tell no more than the prior, such as `elbow.x length`."""
+        """Parameters that the poses do not determine, such as `elbow.x length`."""
         return tuple(
             f"{parameter.name} {parameter.kind}"
             for parameter in self.parameters
@@ -52,37 +57,39 @@ class GeometryIdentification(Model):
 
     def save(self, folder: Path, model: mujoco.MjSpec) -> list[Path]:
         """Write `identification.json`, `joints.yaml` and `model.xml`."""
-        files = [folder / name for name in ("identification.json", "joints.yaml", "model.xml")]
-        files[0].write_text(self.model_dump_json(indent=2) + "\n", encoding="utf-8")
         head = "# stiffness [N·m/rad], by elastic identify --geometry; .inf for a rigid joint"
-        known = [(joint, float(f"{joint.stiffness_nm_per_rad:.6g}")) for joint in self.joints]
-        lines = [yaml_line(joint.joint, {"stiffness": K}, _interval(joint)) for joint, K in known]
-        files[1].write_text("\n".join([head, *lines]) + "\n", encoding="utf-8")
-        files[2].write_text(model.to_xml(), encoding="utf-8")
-        return files
+        lines = [
+            stiffness_line(joint.joint, joint.stiffness_nm_per_rad, _interval(joint))
+            for joint in self.joints
+        ]
+        model_file = folder / "model.xml"
+        model_file.write_text(model.to_xml(), encoding="utf-8")
+        return [*save_result(self, folder, head, lines), model_file]
 
 
 def describe_geometry(fit: GeometryFit, held_out: HeldOut | None) -> GeometryIdentification:
-    """The result of a fit."""
+    """Result of a fit."""
     problem = fit.problem
-    told = {estimate.name: estimate for estimate in fit.estimates if estimate.kind == "compliance"}
+    compliances = {one.name: one for one in fit.estimates if one.kind == "compliance"}
     return GeometryIdentification(
         poses=len(problem.theta),
         numbers=problem.measured.size,
         geometry=problem.geometry,
         lateral=problem.lateral,
         noise_mm=1e3 * fit.noise_m,
-        joints=tuple(_joint(joint, told.get(joint)) for joint in problem.joints),
+        joints=tuple(
+            _joint_compliance(joint, compliances.get(joint)) for joint in problem.model.joints
+        ),
         parameters=fit.estimates,
         held_out=held_out,
     )
 
 
 def correct_model(spec: mujoco.MjSpec, tree: Tree, fit: GeometryFit) -> mujoco.MjSpec:
-    """A copy of a model with the identified lengths and angles.
+    """Copy of a model with the identified lengths and angles.
 
-    It finds meshes and textures wherever it is written to. Encoder offsets are no part of a model:
-    subtract them from what the encoders read.
+    Its paths of meshes and textures are absolute, so that it may be saved anywhere. A model has no
+    encoder offsets: subtract them from the readings of the encoders.
 
     Args:
         spec: Specification of the rigid model.
@@ -100,7 +107,7 @@ def correct_model(spec: mujoco.MjSpec, tree: Tree, fit: GeometryFit) -> mujoco.M
     if spec.textures:
         corrected.texturedir = str(Path(spec.modelfiledir, spec.texturedir).resolve())
     problem = fit.problem
-    for j, joint in enumerate(problem.joints):
+    for j, joint in enumerate(problem.model.joints):
         body = int(model.joint(joint).bodyid[0])
         if model.body_jntnum[body] != 1:
             raise ConfigurationError(
@@ -113,31 +120,32 @@ def correct_model(spec: mujoco.MjSpec, tree: Tree, fit: GeometryFit) -> mujoco.M
         turn = R.T @ turn @ problem.model.nominal[j].T @ R
         anchor = R.T @ (problem.model.anchor[j] - tree.place[above])
         shift = R.T @ problem.model.nominal[j] @ fit.parameters.length[j]
-        own = bodies[body]
-        if own.frame is not None:  # the pose is in the parent, whatever frame it was written in
-            own.set_frame(own.parent.add_frame())
-        own.pos = anchor + shift + turn @ (model.body_pos[body] - anchor)
-        own.quat = quaternion_of(turn @ matrix_of(model.body_quat[body]))
-        own.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
+        target = bodies[body]
+        if target.frame is not None:  # the pose is in the parent, not in the frame of the file
+            target.set_frame(target.parent.add_frame())
+        target.pos = anchor + shift + turn @ (model.body_pos[body] - anchor)
+        target.quat = quaternion_of(turn @ matrix_of(model.body_quat[body]))
+        target.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
     return corrected
 
 
-def _joint(joint: str, estimate: GeometryEstimate | None) -> JointCompliance:
-    """Stiffness by a compliance; rigid where it is not sought, not told, or not above zero."""
+def _joint_compliance(joint: str, estimate: GeometryEstimate | None) -> JointCompliance:
+    """Result of a joint; rigid where its compliance is not determined or not above zero."""
     c = h = 0.0
     if estimate is not None and estimate.value > 0.0 and estimate.is_told:
         c = estimate.value
         h = estimate.half_width
+    low, high = stiffness_interval(c, h)
     return JointCompliance(
         joint=joint,
         stiffness_nm_per_rad=1.0 / c if c else math.inf,
-        stiffness_low_nm_per_rad=1.0 / (c + h) if c else None,
-        stiffness_high_nm_per_rad=1.0 / (c - h) if c > h else None,
+        stiffness_low_nm_per_rad=low,
+        stiffness_high_nm_per_rad=high,
     )
 
 
 def _interval(joint: JointCompliance) -> str:
-    """How well a stiffness is known."""
+    """Interval of a stiffness as text."""
     if joint.stiffness_low_nm_per_rad is None:
         return "rigid"
     high = joint.stiffness_high_nm_per_rad

@@ -17,7 +17,7 @@ from elastic_env.core.errors import ConfigurationError, quote, unknown_name
 from elastic_env.core.signals import Array, IntArray
 
 Kind = Literal["link_encoders", "end_effector", "markers", "imu", "torques"]
-"""Measurements of a log besides the motor encoders."""
+"""Measurement of a log besides the motor encoders."""
 
 KINDS: dict[str, tuple[Kind, str]] = {
     "q": ("link_encoders", "rad"),
@@ -26,40 +26,46 @@ KINDS: dict[str, tuple[Kind, str]] = {
     "imu": ("imu", "rad"),
     "torque": ("torques", "N·m"),
 }
-"""Quantity of a column: what it is of, and its unit."""
+"""Kind of measurement and unit by the quantity of a column."""
+MEASUREMENT_UNITS: dict[Kind, str] = dict(KINDS.values())
+"""Unit by the kind of measurement."""
 AXES: dict[Kind, tuple[str, ...]] = {"end_effector": ("x", "y", "z"), "imu": ("roll", "pitch")}
-"""Columns of what has no joints."""
+"""Columns of measurements that are not made at joints."""
 UNITS = {
     "theta": "rad",
     "direction": "1",
     "tau_known": "N·m",
     **{name: unit for name, (_, unit) in KINDS.items()},
 }
+"""Unit by the quantity of a column."""
 MOST_POSES = 10_000
 """Rows of a log."""
 
-_TABLES = ("theta", "measured", "direction", "known")
+_TABLES = ("theta", "measured", "direction", "known_torque")
 """Fields of a log with a row per pose."""
-_SPELT = {"Nm": "N·m", "N*m": "N·m", "N m": "N·m", "": "1", "-": "1"}
-_BEYOND_RAD = 0.5  # homing errors and bent joints exceed the model's range by less
-_TURNS_RAD = 4.0 * math.pi  # of joints without a range
-_ALIKE_RAD = 1e-3
+_UNIT_SPELLINGS = {"Nm": "N·m", "N*m": "N·m", "N m": "N·m", "": "1", "-": "1"}
+_RANGE_MARGIN_RAD = 0.5
+"""Angle beyond the model's range that is accepted: homing errors and bent joints need less."""
+_UNLIMITED_RAD = 4.0 * math.pi
+"""Largest angle of joints without a range."""
+_EQUAL_WITHIN_RAD = 1e-3
+"""Difference of encoders up to which two poses are the same."""
 
 
 @dataclass(frozen=True)
 class PoseLog:
-    """Static poses and what was measured at them.
+    """Static poses and the measurements at them.
 
     Attributes:
         joints: Names of the joints, (n,).
         theta: Motor encoders, (N, n) [rad].
-        kind: What else was measured.
+        kind: Kind of the measurement.
         columns: Joints or axes of the measurement, (m,).
         measured: The measurement, (N, m), in the unit of its kind.
         direction: Side of approach, (N, n): +1 from below, -1 from above, 0 unknown; None where the
             log has none.
-        known: Known further torque on the joints, (N, n) [N·m], positive where it turns the joint
-            forward; None where the log has none.
+        known_torque: Known further torque on the joints, (N, n) [N·m], positive where it turns the
+            joint forward; None where the log has none.
     """
 
     joints: tuple[str, ...]
@@ -68,16 +74,16 @@ class PoseLog:
     columns: tuple[str, ...]
     measured: Array
     direction: Array | None = None
-    known: Array | None = None
+    known_torque: Array | None = None
 
     def __len__(self) -> int:
         return len(self.theta)
 
     def part(self, poses: IntArray) -> "PoseLog":
-        """Some of its poses."""
+        """Log of some of the poses."""
         tables = {name: getattr(self, name) for name in _TABLES}
-        given = {name: part[poses] for name, part in tables.items() if part is not None}
-        return replace(self, **given)
+        parts = {name: table[poses] for name, table in tables.items() if table is not None}
+        return replace(self, **parts)
 
 
 def read_log(
@@ -87,7 +93,7 @@ def read_log(
 
     Args:
         path: CSV file with a header.
-        ranges: Hinges of the robot and their ranges, infinite where there is none [rad].
+        ranges: Hinges of the robot and their ranges, infinite for a joint without one [rad].
         kind: Measurement to use; needed only where the log has several.
 
     Raises:
@@ -111,17 +117,17 @@ def read_log(
             f"{path} has no motor encoders; give a column theta.JOINT [rad] for each of:"
             f" {', '.join(ranges)}"
         )
-    quantity = _quantity(path, [name for name in KINDS if names[name]], kind)
-    chosen = KINDS[quantity][0]
-    order = _order(path, chosen, names[quantity], joints)
+    quantity = _choose_quantity(path, [name for name in KINDS if names[name]], kind)
+    kind = KINDS[quantity][0]
+    order = _column_order(path, kind, names[quantity], joints)
     log = PoseLog(
         joints,
         theta=_table(columns, "theta", joints),
-        kind=chosen,
+        kind=kind,
         columns=order,
         measured=_table(columns, quantity, order),
         direction=_table(columns, "direction", joints) if names["direction"] else None,
-        known=_table(columns, "tau_known", joints) if names["tau_known"] else None,
+        known_torque=_table(columns, "tau_known", joints) if names["tau_known"] else None,
     )
     sides = np.zeros(0) if log.direction is None else log.direction.ravel()
     if len(wrong := sides[~np.isin(sides, (-1.0, 0.0, 1.0))]):
@@ -130,30 +136,32 @@ def read_log(
             f" got {wrong[0]:g}"
         )
     _require_radians(path, "theta", joints, log.theta, ranges)
-    if chosen == "link_encoders":
+    if kind == "link_encoders":
         _require_radians(path, "q", order, log.measured, ranges)
-    if chosen == "imu":
+    if kind == "imu":
         turn = dict.fromkeys(order, (-math.pi, math.pi))
         _require_radians(path, "imu", order, log.measured, turn)
-    if np.ptp(log.theta, axis=0).max() < _ALIKE_RAD:
+    if np.ptp(log.theta, axis=0).max() < _EQUAL_WITHIN_RAD:
         raise ConfigurationError(
-            f"all {len(log)} poses of {path} are alike: no joint moves by {_ALIKE_RAD} rad; log"
-            " poses that differ in all joints, such as those that --plan proposes"
+            f"all {len(log)} poses of {path} are alike: no joint moves by {_EQUAL_WITHIN_RAD} rad;"
+            " log poses that differ in all joints, such as those that --plan proposes"
         )
     return average_poses(log)
 
 
 def average_poses(log: PoseLog) -> PoseLog:
-    """The log with the mean of consecutive rows whose encoders and sides of approach agree.
+    """Replace consecutive rows with equal encoders and sides of approach by their mean.
 
-    Their friction and the errors of the model are the same, so that they do not count as
-    independent.
+    Their friction and the errors of the model are equal, so that they are not independent.
     """
     sides = np.zeros_like(log.theta) if log.direction is None else log.direction
     starts = [0]
     for row in range(1, len(log)):
-        moved = np.abs(log.theta[row] - log.theta[starts[-1]]).max() > _ALIKE_RAD
-        moved |= log.known is not None and (log.known[row] != log.known[starts[-1]]).any()
+        moved = np.abs(log.theta[row] - log.theta[starts[-1]]).max() > _EQUAL_WITHIN_RAD
+        moved |= (
+            log.known_torque is not None
+            and (log.known_torque[row] != log.known_torque[starts[-1]]).any()
+        )
         if moved or (sides[row] != sides[starts[-1]]).any():
             starts.append(row)
     count = np.diff([*starts, len(log)])[:, None]
@@ -162,7 +170,9 @@ def average_poses(log: PoseLog) -> PoseLog:
         theta=np.add.reduceat(log.theta, starts) / count,
         measured=np.add.reduceat(log.measured, starts) / count,
         direction=None if log.direction is None else sides[starts],
-        known=None if log.known is None else np.add.reduceat(log.known, starts) / count,
+        known_torque=None
+        if log.known_torque is None
+        else np.add.reduceat(log.known_torque, starts) / count,
     )
 
 
@@ -187,57 +197,57 @@ def _columns(path: Path) -> dict[str, Array]:
         most_rows=MOST_POSES,
         example="theta.JOINT [rad] and q.JOINT [rad]",
     )
-    names = [_name(path, text) for text in table.names]
-    if twice := [name for name in names if names.count(name) > 1]:
-        raise ConfigurationError(f"{path} has the column {twice[0]} twice; keep one of them")
+    names = [_column_name(path, text) for text in table.names]
+    if repeated := [name for name in names if names.count(name) > 1]:
+        raise ConfigurationError(f"{path} has the column {repeated[0]} twice; keep one of them")
     return dict(zip(names, table.values.T, strict=True))
 
 
 def _split_unit(text: str) -> tuple[str, str | None]:
-    """A name and the unit in brackets behind it; None where there is none.
+    """A name and the unit in brackets behind it; None without brackets.
 
     A regular expression would take minutes for a long text.
     """
     if text.endswith("]"):
         first = max(text.rfind("]", 0, -1) + 1, 1)
-        at = text.find("[", first)
-        if at > 0:
-            return text[:at].rstrip(), text[at + 1 : -1].strip()
+        bracket = text.find("[", first)
+        if bracket > 0:
+            return text[:bracket].rstrip(), text[bracket + 1 : -1].strip()
     return text, None
 
 
-def _name(path: Path, text: str) -> str:
-    """A column's name without its unit."""
+def _column_name(path: Path, text: str) -> str:
+    """Name of a column without its unit."""
     quantity, _, rest = text.strip().partition(".")
-    of, unit = _split_unit(rest)
-    if quantity not in UNITS or not of or "\n" in of:
+    name, unit = _split_unit(rest)
+    if quantity not in UNITS or not name or "\n" in name:
         raise ConfigurationError(
             f"{path} has the column {quote(text)}; columns are theta.JOINT, q.JOINT, torque.JOINT,"
             " direction.JOINT, tau_known.JOINT, end_effector.x, .y, .z, marker.NAME.x, .y, .z,"
             " imu.roll and imu.pitch"
         )
-    if unit is not None and _SPELT.get(unit, unit) != UNITS[quantity]:
+    if unit is not None and _UNIT_SPELLINGS.get(unit, unit) != UNITS[quantity]:
         raise ConfigurationError(
-            f"{path}, column {quantity}.{quote(of)[1:-1]}: the unit must be [{UNITS[quantity]}],"
+            f"{path}, column {quantity}.{quote(name)[1:-1]}: the unit must be [{UNITS[quantity]}],"
             f" got [{quote(unit)[1:-1]}]; convert the column"
         )
-    return f"{quantity}.{of}"
+    return f"{quantity}.{name}"
 
 
-def _table(columns: Mapping[str, Array], quantity: str, of: Sequence[str]) -> Array:
-    """A quantity of joints or axes, zero for those without a column, (N, n)."""
+def _table(columns: Mapping[str, Array], quantity: str, names: Sequence[str]) -> Array:
+    """A quantity of joints or axes, zero where there is no column, (N, n)."""
     zero = np.zeros(len(next(iter(columns.values()))))
-    return np.stack([columns.get(f"{quantity}.{name}", zero) for name in of], axis=-1)
+    return np.stack([columns.get(f"{quantity}.{name}", zero) for name in names], axis=-1)
 
 
-def _quantity(path: Path, found: Sequence[str], kind: Kind | None) -> str:
-    """The quantity to use, as columns name it."""
-    kinds: dict[str, str] = {KINDS[name][0]: name for name in found}
+def _choose_quantity(path: Path, quantities: Sequence[str], kind: Kind | None) -> str:
+    """The measured quantity to use, one of those in the log."""
+    kinds: dict[str, str] = {KINDS[name][0]: name for name in quantities}
     if kind is not None and kind in kinds:
         return kinds[kind]
-    if len(found) == 1 and kind is None:
-        return found[0]
-    if len(found) > 1:
+    if len(quantities) == 1 and kind is None:
+        return quantities[0]
+    if len(quantities) > 1:
         raise ConfigurationError(
             f"{path} has several measurements ({', '.join(kinds)}) and one is used; choose it by"
             " --measured-by"
@@ -250,55 +260,61 @@ def _quantity(path: Path, found: Sequence[str], kind: Kind | None) -> str:
     )
 
 
-def _order(path: Path, kind: Kind, given: Sequence[str], joints: Sequence[str]) -> tuple[str, ...]:
-    """Columns of a measurement in order; all axes must be there, and a motor encoder by joint."""
+def _column_order(
+    path: Path, kind: Kind, columns: Sequence[str], joints: Sequence[str]
+) -> tuple[str, ...]:
+    """Columns of a measurement in order.
+
+    Raises:
+        ConfigurationError: An axis is missing, or the motor encoder of a joint.
+    """
     if kind in AXES:
-        if sorted(given) != sorted(AXES[kind]):
+        if sorted(columns) != sorted(AXES[kind]):
             raise ConfigurationError(
                 f"{path}: {kind} needs exactly the columns {', '.join(AXES[kind])}, got"
-                f" {', '.join(given)}"
+                f" {', '.join(columns)}"
             )
         return AXES[kind]
     if kind != "markers":
-        if without := [joint for joint in given if joint not in joints]:
+        if without := [joint for joint in columns if joint not in joints]:
             raise ConfigurationError(
                 f"{path} measures {', '.join(without)} and lacks theta.{without[0]}; add the column"
             )
-        return tuple(joint for joint in joints if joint in given)
+        return tuple(joint for joint in joints if joint in columns)
     order: list[str] = []
-    for name in dict.fromkeys(column.rpartition(".")[0] for column in given):
-        own = sorted(column for column in given if column.rpartition(".")[0] == name)
-        if not name or own != [f"{name}.{axis}" for axis in "xyz"]:
+    for name in dict.fromkeys(column.rpartition(".")[0] for column in columns):
+        axes = sorted(column for column in columns if column.rpartition(".")[0] == name)
+        if not name or axes != [f"{name}.{axis}" for axis in "xyz"]:
             raise ConfigurationError(
                 f"{path}: a marker needs the columns marker.NAME.x, .y and .z, where NAME is a site"
-                f" or body of the model; got marker.{own[0]}"
+                f" or body of the model; got marker.{axes[0]}"
             )
-        order += own
+        order += axes
     return tuple(order)
 
 
 def _require_radians(
     path: Path,
     quantity: str,
-    of: Sequence[str],
+    names: Sequence[str],
     angles: Array,
     ranges: Mapping[str, tuple[float, float]],
 ) -> None:
     """Refuse angles that the joints cannot reach, such as degrees."""
-    bounds = np.array([ranges[name] for name in of])
+    bounds = np.array([ranges[name] for name in names])
     finite = np.isfinite(bounds)
-    low = np.where(finite[:, 0], bounds[:, 0] - _BEYOND_RAD, -_TURNS_RAD)
-    high = np.where(finite[:, 1], bounds[:, 1] + _BEYOND_RAD, _TURNS_RAD)
-    beyond = (angles < low) | (angles > high)
-    if not beyond.any():
+    low = np.where(finite[:, 0], bounds[:, 0] - _RANGE_MARGIN_RAD, -_UNLIMITED_RAD)
+    high = np.where(finite[:, 1], bounds[:, 1] + _RANGE_MARGIN_RAD, _UNLIMITED_RAD)
+    outside = (angles < low) | (angles > high)
+    if not outside.any():
         return
-    pose, column = np.argwhere(beyond)[0]
+    pose, column = np.argwhere(outside)[0]
     in_degrees = np.deg2rad(angles)
     cure = "give angles in radians, in the zero and the sign of the model"
     if ((in_degrees >= low) & (in_degrees <= high)).all():
         cure = "the angles look like degrees: convert them to radians"
     raise ConfigurationError(
-        f"{path}, pose {pose + 1}, column {quantity}.{of[column]}: {angles[pose, column]:g} rad"
+        f"{path}, pose {pose + 1}, column {quantity}.{names[column]}: {angles[pose, column]:g} rad"
         f" lies beyond the joint's range of {bounds[column, 0]:g} to {bounds[column, 1]:g} rad;"
         f" {cure}"
     )

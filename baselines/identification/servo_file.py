@@ -42,15 +42,16 @@ _JSON_NAMES = {
     "present_current": "current",
     "torque_enable": "torque_enable",
 }
-"""Names of Rhoban's recorder, and of others who follow it."""
+"""Columns by the keys of Rhoban's recorder, which others use too."""
 _FACTS = {"mass": "kg", "length": "m", "kp": "1", "vin": "V", "arm_mass": "kg"}
 """Facts of a run with their units; others are not used."""
 _LONGEST_JSON = 20_000_000
-_LARGEST = 1e300
+"""Characters of a JSON file, at most."""
+_LARGEST_NUMBER = 1e300
 
 
 class Content(NamedTuple):
-    """Content of a file: columns, facts of the run, and the unit of angles if it says one."""
+    """Columns of a file, facts of the run, and the unit of angles if the file gives one."""
 
     columns: dict[str, Array]
     facts: dict[str, float]
@@ -62,13 +63,13 @@ def is_servo_log(path: Path) -> bool:
     if path.suffix.lower() in (".json", ".parquet"):
         return True
     try:
-        if not path.is_file():  # a named pipe would be waited for
+        if not path.is_file():  # reading a named pipe would wait for data
             return False
         with path.open(encoding="utf-8-sig", errors="replace") as file:
             head = file.readline(10_000)
     except (OSError, ValueError):
         return False
-    return "time" in [_plain(cell) for cell in head.split(",")]
+    return "time" in [_column_name(cell) for cell in head.split(",")]
 
 
 def read_content(path: Path, joint: str | None) -> Content:
@@ -92,8 +93,8 @@ def read_content(path: Path, joint: str | None) -> Content:
     return content
 
 
-def _plain(cell: str) -> str:
-    """A column's name without its unit."""
+def _column_name(cell: str) -> str:
+    """Name of a column without its unit."""
     return cell.strip().strip('"').partition("[")[0].strip()
 
 
@@ -108,35 +109,35 @@ def _read_csv(path: Path, joint: str | None) -> Content:
     columns: dict[str, Array] = {}
     units: dict[str, str] = {}
     for text, values in zip(table.names, table.values.T, strict=True):
-        name = _plain(text)
-        known = name == "tau_known" or name.startswith("tau_known.")
-        if known and joint is not None and name not in ("tau_known", f"tau_known.{joint}"):
+        name = _column_name(text)
+        is_torque = name == "tau_known" or name.startswith("tau_known.")
+        if is_torque and joint is not None and name not in ("tau_known", f"tau_known.{joint}"):
             continue
-        unit = "N·m" if known else _COLUMNS.get(name)
+        unit = "N·m" if is_torque else _COLUMNS.get(name)
         if unit is None:
             raise ConfigurationError(
                 f"{path} has the column {quote(text)}; columns are {', '.join(_COLUMNS)} and"
                 " tau_known.JOINT"
             )
-        given = text.partition("[")[2].rstrip("] ").replace("Nm", "N·m")
-        if given and given != unit and not (unit == "rad" and given == "deg"):
+        file_unit = text.partition("[")[2].rstrip("] ").replace("Nm", "N·m")
+        if file_unit and file_unit != unit and not (unit == "rad" and file_unit == "deg"):
             allowed = "[rad] or [deg]" if unit == "rad" else f"[{unit}]"
             raise ConfigurationError(
-                f"{path}, column {name}: the unit must be {allowed}, got [{quote(given)[1:-1]}];"
-                " convert the column"
+                f"{path}, column {name}: the unit must be {allowed}, got"
+                f" [{quote(file_unit)[1:-1]}]; convert the column"
             )
         if unit == "rad":
-            units[name] = given
-        field = "known" if known else name
+            units[name] = file_unit
+        field = "known_torque" if is_torque else name
         if field in columns:
-            cure = "name the joint by --joints" if known else "keep one of them"
+            cure = "name the joint by --joints" if is_torque else "keep one of them"
             raise ConfigurationError(f"{path} has several columns {name.partition('.')[0]}; {cure}")
         columns[field] = values
     return Content(columns, {}, _angle_unit(path, units))
 
 
 def _angle_unit(path: Path, units: Mapping[str, str]) -> AngleUnit | None:
-    """Unit of the angles by the header; None if it says none.
+    """Unit of the angles in the header; None if the header has none.
 
     Raises:
         ConfigurationError: Only one of goal and position is in degrees.
@@ -152,7 +153,7 @@ def _angle_unit(path: Path, units: Mapping[str, str]) -> AngleUnit | None:
 
 
 def _read_json(path: Path, joint: str | None) -> Content:
-    """A log of Rhoban's recorder: facts of the run, and a list of entries."""
+    """Read a log of Rhoban's recorder: facts of the run, and a list of entries."""
     del joint
     try:
         content = parse_json(read_bounded(path, LARGEST_BYTES).decode("utf-8"), most=_LONGEST_JSON)
@@ -181,7 +182,7 @@ def _read_json(path: Path, joint: str | None) -> Content:
                 " in all entries or in none"
             )
         columns[name] = np.array(
-            [_entry(path, number, key, entry[key]) for number, entry in enumerate(entries, 1)]
+            [_entry_value(path, number, key, entry[key]) for number, entry in enumerate(entries, 1)]
         )
     return Content(columns, _facts(path, content))
 
@@ -190,25 +191,25 @@ def _facts(path: Path, content: Mapping[str, Any]) -> dict[str, float]:
     """Facts of a run that are used.
 
     Raises:
-        ConfigurationError: One is no positive number.
+        ConfigurationError: A fact is no positive number.
     """
     facts = {}
     for key, unit in _FACTS.items():
         value = content.get(key)
         if value is None:
             continue
-        may_vanish = key == "arm_mass"
-        if not _is_number(value) or value < 0.0 or (value == 0.0 and not may_vanish):
+        may_be_zero = key == "arm_mass"
+        if not _is_number(value) or value < 0.0 or (value == 0.0 and not may_be_zero):
             raise ConfigurationError(
-                f"{path}: {key} must be a number {'of at least' if may_vanish else 'above'} 0"
+                f"{path}: {key} must be a number {'of at least' if may_be_zero else 'above'} 0"
                 f" [{unit}], got {quote(str(value))[1:-1]}"
             )
         facts[key] = float(value)
     return facts
 
 
-def _entry(path: Path, number: int, key: str, value: Any) -> float:
-    """Value of an entry; only whether the torque is on may be a truth value."""
+def _entry_value(path: Path, number: int, key: str, value: Any) -> float:
+    """Value of an entry; only `torque_enable` may be a boolean."""
     if not _is_number(value) and not (key == "torque_enable" and isinstance(value, bool)):
         raise ConfigurationError(
             f"{path}, entry {number}: {key} must be a number, got {quote(str(value))[1:-1]}"
@@ -218,11 +219,11 @@ def _entry(path: Path, number: int, key: str, value: Any) -> float:
 
 def _is_number(value: Any) -> bool:
     is_real = isinstance(value, int | float) and not isinstance(value, bool)
-    return is_real and abs(value) < _LARGEST
+    return is_real and abs(value) < _LARGEST_NUMBER
 
 
 def _read_parquet(path: Path, joint: str | None) -> Content:
-    """An episode of LeRobot."""
+    """Read an episode of LeRobot."""
     table = read_episodes(path)
     episodes = np.unique(table.episode)
     if len(episodes) > 1:
@@ -230,11 +231,11 @@ def _read_parquet(path: Path, joint: str | None) -> Content:
             f"{path} has {len(episodes)} episodes; elastic lerobot FOLDER writes a log of each"
         )
     count = min(table.goal.shape[1], table.position.shape[1])
-    at = _joint_number(path, joint, count)
+    index = _joint_number(path, joint, count)
     columns = {
         "time": table.time,
-        "goal": table.goal[:, at],
-        "position": table.position[:, at],
+        "goal": table.goal[:, index],
+        "position": table.position[:, index],
     }
     return Content(columns, {})
 
@@ -243,7 +244,7 @@ class EpisodeTable(NamedTuple):
     """Rows of a parquet file of LeRobot.
 
     Attributes:
-        time: Since the begin of the episode, (N,) [s].
+        time: Time since the start of the episode, (N,) [s].
         goal: Values of `action`, (N, n).
         position: Values of `observation.state`, (N, m).
         episode: Number of the episode; 0 where the file has none, (N,).
@@ -256,11 +257,11 @@ class EpisodeTable(NamedTuple):
 
 
 def read_episodes(path: Path, most_bytes: int = LARGEST_BYTES) -> EpisodeTable:
-    """Rows of a parquet file of LeRobot: `timestamp`, and the lists `action`, `observation.state`.
+    """Read `timestamp`, `action` and `observation.state` of a parquet file of LeRobot.
 
     Args:
         path: The file.
-        most_bytes: Bytes that it may have.
+        most_bytes: Largest size of the file.
 
     Raises:
         ConfigurationError: It cannot be read, or has other columns.
@@ -299,7 +300,7 @@ def _parquet_column(path: Path, key: str, cells: list[Any]) -> Array:
     """Numbers of a column, (N, number of joints).
 
     Raises:
-        ConfigurationError: They are not as many in each row, or no finite numbers.
+        ConfigurationError: The rows have different lengths, or contain no finite numbers.
     """
     rows = [np.ravel(cell) for cell in cells]
     if len({len(row) for row in rows}) > 1 or not len(rows[0]):
@@ -316,10 +317,10 @@ def _parquet_column(path: Path, key: str, cells: list[Any]) -> Array:
 
 
 def _joint_number(path: Path, joint: str | None, count: int) -> int:
-    """Place of a joint; a file of one joint needs no number.
+    """Index of a joint; a file of one joint needs no number.
 
     Raises:
-        ConfigurationError: It is no number of a joint.
+        ConfigurationError: `joint` is no number of a joint.
     """
     is_number = joint is not None and joint.isascii() and joint.isdecimal() and len(joint) < 10
     if count == 1 and not is_number:

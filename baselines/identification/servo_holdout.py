@@ -1,9 +1,10 @@
-"""Replay of logs that were not fitted, beside predictions that need no physics."""
+"""Errors of a replay at logs that were not fitted, compared with rivals that need no physics."""
 
 from collections.abc import Sequence
 
 import numpy as np
 
+from baselines.identification.rivals import predict_linear
 from baselines.identification.servo_fit import ServoFit
 from baselines.identification.servo_log import FEWEST_ROWS, ServoLog, slow_rows
 from elastic_env.core.config import Model
@@ -12,6 +13,7 @@ from elastic_env.core.signals import Array
 
 PREDICTIONS = ("the goal itself", "a constant offset", "a line in the goal", "identified")
 _FEWEST_HELD_OUT = 20
+"""Rows that are held out of a single log, at least."""
 
 
 class ServoError(Model):
@@ -19,9 +21,9 @@ class ServoError(Model):
 
     name: str
     rms_mrad: float
-    """Root mean square over all rows with torque on, logs weighted alike."""
+    """Root mean square over all rows with torque on; all logs have equal weights."""
     slow_mrad: float | None
-    """The same over rows of slow motion, each alike; None where nothing moves slowly."""
+    """Root mean square over all rows of slow motion; None where nothing moves slowly."""
 
 
 class LogErrors(Model):
@@ -30,11 +32,11 @@ class LogErrors(Model):
     log: str
     gain: float
     rms_mrad: tuple[float, ...]
-    """One for each prediction."""
+    """Error of each prediction."""
     slow_mrad: tuple[float, ...] | None
     slow_rows: int
     replay_mrad: float
-    """Of the replay over all rows, those with the torque off included."""
+    """Error of the replay over all rows, also those with the torque off."""
     off_rows: int = 0
     """Rows with the torque off, which `rms_mrad` leaves out."""
 
@@ -44,9 +46,9 @@ class ServoHoldout(Model):
 
     fitted: tuple[str, ...]
     replay_mrad: float
-    """Root mean square of the replay over all rows of the logs, torque off included."""
+    """Root mean square of the replay over all rows of the logs, also those with the torque off."""
     errors: tuple[ServoError, ...]
-    """Of the rivals, and the identification last."""
+    """Errors of the rivals, and of the identification last."""
     logs: tuple[LogErrors, ...]
 
     @property
@@ -56,7 +58,7 @@ class ServoHoldout(Model):
 
     @property
     def best_rival(self) -> ServoError:
-        """The best prediction but the identification."""
+        """The best prediction except the identification."""
         return min(self.errors[:-1], key=lambda error: error.rms_mrad)
 
 
@@ -65,17 +67,17 @@ def judge_servo(fit: ServoFit, held_out: Sequence[ServoLog]) -> ServoHoldout:
 
     Args:
         fit: A fit to other logs.
-        held_out: Logs that it did not see.
+        held_out: Logs that were not fitted.
     """
     logs = []
     slow = []
     for log in held_out:
-        played = fit.replay(log)
-        errors = np.vstack([rivals(fit.logs, log), played]) - log.position
-        slowly = np.vstack([rivals(fit.logs, log, slow=True), played]) - log.position
-        slow.append(slowly[:, slow_rows(log)])
-        logs.append(_of_log(log, errors, slow[-1]))
-    slowly = np.concatenate(slow, axis=1)
+        replay = fit.replay(log)
+        errors = np.vstack([rivals(fit.logs, log), replay]) - log.position
+        after_slow = np.vstack([rivals(fit.logs, log, slow=True), replay]) - log.position
+        slow.append(after_slow[:, slow_rows(log)])
+        logs.append(_log_errors(log, errors, slow[-1]))
+    slow_errors = np.concatenate(slow, axis=1)
     total = np.array([log.rms_mrad for log in logs])
     return ServoHoldout(
         fitted=tuple(log.name for log in fit.logs),
@@ -84,7 +86,7 @@ def judge_servo(fit: ServoFit, held_out: Sequence[ServoLog]) -> ServoHoldout:
             ServoError(
                 name=name,
                 rms_mrad=float(np.sqrt(np.mean(total[:, i] ** 2))),
-                slow_mrad=_mrad(slowly[i]) if slowly.shape[1] else None,
+                slow_mrad=_rms_mrad(slow_errors[i]) if slow_errors.shape[1] else None,
             )
             for i, name in enumerate(PREDICTIONS)
         ),
@@ -95,38 +97,32 @@ def judge_servo(fit: ServoFit, held_out: Sequence[ServoLog]) -> ServoHoldout:
 def rivals(fitted: Sequence[ServoLog], log: ServoLog, *, slow: bool = False) -> Array:
     """Angles of a log by predictions without physics, (3, N) [rad].
 
-    Offset and line are those of the fitted logs with the same gain, or of all if there are none.
+    They learn from the fitted logs with the same gain, or from all if there are none.
 
     Args:
         fitted: Logs to learn from.
         log: Log to predict.
         slow: Learn from rows of slow motion only, where there are any.
     """
-    own = [one for one in fitted if one.gain == log.gain and one.enabled.any()]
-    own = own or [one for one in fitted if one.enabled.any()]
-    offset = 0.0
-    line = np.array([0.0, 1.0])
-    if own:
-        rows = [slow_rows(one) if slow else one.enabled for one in own]
-        if not any(part.any() for part in rows):
-            rows = [one.enabled for one in own]
-        goal = np.concatenate([one.goal[part] for one, part in zip(own, rows, strict=True)])
-        position = np.concatenate([one.position[part] for one, part in zip(own, rows, strict=True)])
-        offset = float(np.mean(position - goal))
-        line = fit_line(goal, position)
-    return np.stack([log.goal, log.goal + offset, line[0] + line[1] * log.goal])
-
-
-def fit_line(goal: Array, position: Array) -> Array:
-    """Constant and slope of the least-squares line, (2,)."""
-    rows = np.column_stack([np.ones(len(goal)), goal])
-    return np.linalg.lstsq(rows, position, rcond=None)[0]
+    powered = [other for other in fitted if other.enabled.any()]
+    alike = [other for other in powered if other.gain == log.gain] or powered
+    if not alike:
+        return np.stack([log.goal] * 3)
+    rows = [slow_rows(other) if slow else other.enabled for other in alike]
+    if not any(part.any() for part in rows):
+        rows = [other.enabled for other in alike]
+    chosen = list(zip(alike, rows, strict=True))
+    goal = np.concatenate([other.goal[part] for other, part in chosen])
+    position = np.concatenate([other.position[part] for other, part in chosen])
+    offset = float(np.mean(position - goal))
+    line = predict_linear(goal[:, None], position[:, None], log.goal[:, None])[:, 0]
+    return np.stack([log.goal, log.goal + offset, line])
 
 
 def split_logs(
     logs: Sequence[ServoLog], share: float, seed: int
 ) -> tuple[list[ServoLog], list[ServoLog]]:
-    """Logs to fit and logs to hold out; of a single log its last part.
+    """Logs to fit and logs to hold out; a single log is cut, and its last part is held out.
 
     Args:
         logs: All logs.
@@ -137,14 +133,14 @@ def split_logs(
         ConfigurationError: A part of a single log has too few rows.
     """
     if len(logs) == 1:
-        at = round((1.0 - share) * len(logs[0]))
-        if at < FEWEST_ROWS or len(logs[0]) - at < _FEWEST_HELD_OUT:
+        cut = round((1.0 - share) * len(logs[0]))
+        if cut < FEWEST_ROWS or len(logs[0]) - cut < _FEWEST_HELD_OUT:
             raise ConfigurationError(
-                f"--holdout {share:g} fits {at} rows of {logs[0].name} and holds out"
-                f" {len(logs[0]) - at}, at least {FEWEST_ROWS} and {_FEWEST_HELD_OUT} are needed;"
+                f"--holdout {share:g} fits {cut} rows of {logs[0].name} and holds out"
+                f" {len(logs[0]) - cut}, at least {FEWEST_ROWS} and {_FEWEST_HELD_OUT} are needed;"
                 " choose another share, 0 for none, or give more logs"
             )
-        return [logs[0].part(slice(0, at))], [logs[0].part(slice(at, None))]
+        return [logs[0].part(slice(0, cut))], [logs[0].part(slice(cut, None))]
     count = min(max(1, round(share * len(logs))), len(logs) - 1)
     order = np.random.default_rng(seed).permutation(len(logs))
     chosen = set(order[:count].tolist())
@@ -154,18 +150,18 @@ def split_logs(
     )
 
 
-def _of_log(log: ServoLog, errors: Array, slow: Array) -> LogErrors:
+def _log_errors(log: ServoLog, errors: Array, slow: Array) -> LogErrors:
     on = log.enabled if log.enabled.any() else np.ones(len(log), dtype=np.bool_)
     return LogErrors(
         log=log.name,
         gain=log.register,
-        rms_mrad=tuple(_mrad(error[on]) for error in errors),
-        slow_mrad=tuple(map(_mrad, slow)) if slow.size else None,
+        rms_mrad=tuple(_rms_mrad(error[on]) for error in errors),
+        slow_mrad=tuple(map(_rms_mrad, slow)) if slow.size else None,
         slow_rows=slow.shape[1],
-        replay_mrad=_mrad(errors[-1]),
+        replay_mrad=_rms_mrad(errors[-1]),
         off_rows=int((~on).sum()),
     )
 
 
-def _mrad(errors: Array) -> float:
+def _rms_mrad(errors: Array) -> float:
     return 1e3 * float(np.sqrt(np.mean(errors**2)))

@@ -17,12 +17,12 @@ GRAVITY = 9.80665
 class Load:
     """Known load of the joint: weight that pulls by −m g l sin(q − rest), and its inertia.
 
-    Any rigid load on one hinge has this form while the joints before it stand.
+    Any rigid load on one hinge has this form while the joints before it stand still.
 
     Attributes:
-        torque: m g l, the largest torque of the weight [N·m]; zero without one.
+        torque: m g l, the largest torque of the weight [N·m]; zero without a weight.
         rest: Angle at which it hangs [rad].
-        inertia: Of link and load about the joint [kg·m²]; None if it is sought.
+        inertia: Inertia of link and load about the joint [kg·m²]; None if it is unknown.
     """
 
     torque: float = 0.0
@@ -31,7 +31,7 @@ class Load:
 
     @staticmethod
     def pendulum(mass_kg: float, length_m: float, rod_kg: float = 0.0) -> "Load":
-        """A point mass at the end of a uniform rod that hangs at zero."""
+        """Load of a point mass at the end of a uniform rod that hangs at zero."""
         return Load(
             GRAVITY * (mass_kg + rod_kg / 2.0) * length_m,
             0.0,
@@ -43,10 +43,10 @@ class Load:
         return -self.torque * np.sin(q - self.rest)
 
     @staticmethod
-    def of_joint(model: mujoco.MjModel, joint: str) -> "Load":
-        """Links beyond a hinge of a robot.
+    def from_model(model: mujoco.MjModel, joint: str) -> "Load":
+        """Load of the links beyond a hinge of a robot.
 
-        Its other joints stand where its first keyframe has them, or at the reference.
+        The other joints are at the first keyframe, or at the reference.
 
         Raises:
             ConfigurationError: The model has no such hinge.
@@ -58,19 +58,19 @@ class Load:
             raise ConfigurationError("the model has no gravity, so that nothing loads the joint")
         data = mujoco.MjData(model)
         hinge = model.joint(joint)
-        at = int(hinge.dofadr[0])
-        pulls = []
+        dof = int(hinge.dofadr[0])
+        torques = []
         for angle in (0.0, 0.5 * np.pi):
             data.qpos[:] = home_of(model)
             data.qpos[hinge.qposadr[0]] = angle
             mujoco.mj_forward(model, data)
-            pulls.append(-float(data.qfrc_bias[at]))
+            torques.append(-float(data.qfrc_bias[dof]))
         full = np.zeros((model.nv, model.nv))
         mujoco.mj_fullM(model, data, full)
-        inertia = float(full[at, at] - model.dof_armature[at])
-        rest = float(np.arctan2(pulls[0], -pulls[1]))
-        return Load(float(np.hypot(*pulls)), rest, inertia)
+        inertia = float(full[dof, dof] - model.dof_armature[dof])
+        rest = float(np.arctan2(torques[0], -torques[1]))
+        return Load(float(np.hypot(*torques)), rest, inertia)
 
 
 NO_LOAD = Load()
-"""Nothing hangs on the joint, or the log says its torque."""
+"""Load of a joint that carries nothing, or whose torque is a column of the log."""

@@ -1,6 +1,4 @@
-"""What is sought of a servo from its logs: parameters, priors, residuals, and a start.
-
-The start solves the equation of motion, which is linear in the parameters where the joint moves.
+"""Unknown parameters of a servo, their priors, and the residuals of replayed logs.
 
 [Bock1983] H. G. Bock, "Recent Advances in Parameter Identification Techniques for O.D.E.".
 """
@@ -10,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import least_squares, lsq_linear
+from scipy.optimize import least_squares
 
 from baselines.identification.servo_log import ServoLog
 from baselines.identification.servo_replay import NAMES, STEP_S, Replay
@@ -18,60 +16,66 @@ from elastic_env.core.errors import ElasticError
 from elastic_env.core.signals import Array, IntArray
 
 VISCOUS_SHARE = 0.2
-"""Viscous friction over all damping where the torque is never off, as published models of small
-servos have it: 22 % for the XL330 (Duclusaud et al., ICRA 2025)."""
+"""Viscous friction over all damping where the torque is never off, by published models of small
+servos: 22 % for the XL330 (Duclusaud et al., ICRA 2025)."""
 USUAL_LOSS = (0.25, 0.15)
-"""Mean and standard deviation of c before a log is seen: gear trains pass 60 to 90 %."""
+"""Mean and standard deviation of c before a log is used: gear trains pass 60 to 90 %."""
 PRIORS = 2
-"""Residuals that priors add: of c and of the no-load speed."""
-AT = {name: i for i, name in enumerate(NAMES)}
-"""Places of the parameters."""
+"""Residuals that priors add: for c and for the no-load speed."""
+INDEX = {name: i for i, name in enumerate(NAMES)}
+"""Index of each parameter."""
 FIRST_ROWS = 5
-"""Rows from which angle and speed at the start are taken."""
+"""Rows that give angle and speed at the start."""
 STEP = 1e-3
 """Step of difference quotients, in units of the scales."""
+MOVING = 0.05
+"""Speed above which a joint moves [rad/s]."""
 _NO_LOAD_SPEED = 8.0
-_NO_LOAD_SPREAD = 0.5
+_NO_LOAD_DEVIATION = 0.5
 """No-load speed [rad/s] and the deviation of its logarithm: data sheets have 4 to 16 rad/s."""
-_MOVING = 0.05
 _MOST_ROWS = 600
-_COARSE_S = 3.4e-3
-_DELAY_S = 0.06
+"""About the number of rows of a log that a thinned residual has."""
+_COARSE_STEP_S = 3.4e-3
+_LONGEST_DELAY_S = 0.06
+_DELAY_SCALE_S = 0.01
 _LEAD_SCALE_S = 0.01
-_LONGEST_LEAD_S = 0.2  # where nothing is switched
+_LONGEST_LEAD_S = 0.2
+"""Bound of the lead where nothing is switched."""
 _LEAST_TORQUE = 1e-9
-_FEWEST_IN_PART = 5
-_FEWEST_AT_LIMIT = 20
-_PROPORTIONAL = 0.98
-_SATURATED = 0.6
-_LEAST_START = 0.05
-_NO_LIMIT = 1e6
+"""Largest torque of the load below which the joint counts as unloaded [N·m]."""
+_FEWEST_ROWS_OF_PART = 5
+_FEWEST_ROWS_AT_LIMIT = 20
+"""Rows with the largest PWM that show a torque limit."""
+_LEAST_CORRELATION = 0.98
+"""Correlation of PWM and error above which the PWM is proportional to the error."""
+_FIRST_LIMIT_SHARE = 0.6
+"""First torque limit over the largest torque of a servo without limit."""
 
 
 @dataclass(frozen=True)
 class ServoProblem:
-    """Replays and what is sought of them, in units in which all parameters are about 1.
+    """Replays and unknown parameters, in units in which all parameters are about 1.
 
     Attributes:
         replays: Logs to replay.
         scale: Units of the parameters, (13,).
         lower, upper: Bounds of the parameters in these units, (13,).
-        duty: T/k, where the logs tell it [rad].
-        split_damping: Whether the logs tell viscous friction apart from the back-EMF.
-        weight: Of a prior's deviation among the residuals; 0 for no priors.
+        limit_per_gain: T/k [rad]; None if the logs do not determine it.
+        split_damping: True if the logs separate viscous friction from the back-EMF.
+        weight: Weight of a prior's deviation among the residuals; 0 for no priors.
     """
 
     replays: tuple[Replay, ...]
     scale: Array
     lower: Array
     upper: Array
-    duty: float | None
+    limit_per_gain: float | None
     split_damping: bool
     weight: float = 0.0
 
     @classmethod
-    def of(cls, logs: Sequence[ServoLog]) -> "ServoProblem":
-        """The whole logs, without priors.
+    def from_logs(cls, logs: Sequence[ServoLog]) -> "ServoProblem":
+        """Problem of the whole logs, without priors.
 
         Raises:
             ElasticError: Nothing loads the joint.
@@ -97,7 +101,7 @@ class ServoProblem:
             "static_friction": 0.1 * torque,
             "stribeck_speed": 0.3,
             "zero_offset": 0.02,
-            "delay": 0.01,
+            "delay": _DELAY_SCALE_S,
             "switch_lead": _LEAD_SCALE_S,
         }
         bounds = dict.fromkeys(NAMES, (0.0, 1e3)) | {
@@ -105,7 +109,7 @@ class ServoProblem:
             "load_friction": (0.0, 0.9 / 0.3),
             "stribeck_speed": (0.05, 10.0),
             "zero_offset": (-10.0, 10.0),
-            "delay": (0.0, _DELAY_S / 0.01),
+            "delay": (0.0, _LONGEST_DELAY_S / _DELAY_SCALE_S),
             "switch_lead": (0.0, _shortest_gap(logs) / _LEAD_SCALE_S),
         }
         lower, upper = np.transpose([bounds[name] for name in NAMES])
@@ -114,28 +118,28 @@ class ServoProblem:
             scale=np.array([scale[name] for name in NAMES]),
             lower=lower,
             upper=upper,
-            duty=duty_per_torque_gain(logs),
+            limit_per_gain=find_limit_per_gain(logs),
             split_damping=any((~log.enabled).sum() > 0.1 * len(log) for log in logs),
         )
 
     @property
     def logs(self) -> list[ServoLog]:
         """Logs that are replayed."""
-        return [one.log for one in self.replays]
+        return [replay.log for replay in self.replays]
 
     def without_priors(self) -> "ServoProblem":
-        """The residuals of the logs alone."""
+        """Problem without the residuals of priors."""
         return replace(self, weight=0.0)
 
-    def with_steps(self, longest_s: float = _COARSE_S) -> "ServoProblem":
-        """The same with steps of at most so long [s]."""
+    def with_steps(self, longest_s: float = _COARSE_STEP_S) -> "ServoProblem":
+        """Problem with steps of at most `longest_s` [s]."""
         return replace(self, replays=tuple(prepare(log, longest_s) for log in self.logs))
 
-    def in_parts(self, seconds: float) -> "ServoProblem":
+    def with_parts(self, seconds: float) -> "ServoProblem":
         """Replays of short parts, each from the measured angle and speed at its first row.
 
-        A short replay goes wrong little with wrong parameters, so that its least squares have
-        hardly any local minima [Bock1983]; a long one then starts close to its own.
+        A short replay deviates little with wrong parameters, so that its least squares have hardly
+        any local minima [Bock1983]. A long replay then starts close to its own minimum.
         """
         parts = []
         for log in self.logs:
@@ -143,14 +147,16 @@ class ServoProblem:
             count = max(1, round((log.time[-1] - log.time[0]) / seconds))
             edges = np.searchsorted(log.time, np.linspace(log.time[0], log.time[-1], count + 1))
             for first, last in itertools.pairwise(edges):
-                if last - first >= _FEWEST_IN_PART:
-                    own = log.part(slice(first, last + 1))
-                    parts.append(Replay.of(own, float(speed[first]), longest_s=_COARSE_S))
+                if last - first >= _FEWEST_ROWS_OF_PART:
+                    part = log.part(slice(first, last + 1))
+                    parts.append(
+                        Replay.from_log(part, float(speed[first]), longest_s=_COARSE_STEP_S)
+                    )
         return replace(self, replays=tuple(parts))
 
     @property
-    def always_sought(self) -> IntArray:
-        """Parameters that every fit seeks."""
+    def basic_parameters(self) -> IntArray:
+        """Indices of the parameters that every fit of these logs estimates."""
         names = ["rotor_inertia", "coulomb_friction", "load_friction"]
         if any(log.load.inertia is None for log in self.logs):
             names[0] = "link_inertia"
@@ -162,80 +168,92 @@ class ServoProblem:
             names.append("switch_lead")
         if any(log.load.torque > 0.0 for log in self.logs):
             names.append("zero_offset")
-        return np.sort([AT[name] for name in names])
+        return np.sort([INDEX[name] for name in names])
 
-    def sought_where_shown(self, z: Array) -> list[dict[str, float]]:
-        """Effects that are sought where they show, each with a start beside parameters z."""
-        further = []
-        if self.duty is None and any(log.enabled.any() for log in self.logs):
-            gain = self.expand(z)[AT["position_gain"]]
-            pulls = [
+    def optional_effects(self, z: Array) -> list[dict[str, float]]:
+        """Effects that are estimated only if they lower the error: first values of parameters.
+
+        Args:
+            z: The other parameters, in their scales, (13,).
+        """
+        effects = []
+        if self.limit_per_gain is None and any(log.enabled.any() for log in self.logs):
+            gain = self.expand(z)[INDEX["position_gain"]]
+            torques = [
                 gain * log.register * log.supply * np.abs(log.goal - log.position)[log.enabled]
                 for log in self.logs
             ]
-            # what the servo would give without a limit
-            largest = float(np.concatenate(pulls).max()) / self.scale[AT["torque_limit"]]
-            further.append({"torque_limit": _SATURATED * largest})
-        further.append({"static_friction": 0.5, "stribeck_speed": 1.0})
-        return further
+            # torque of a servo without limit
+            largest = float(np.concatenate(torques).max()) / self.scale[INDEX["torque_limit"]]
+            effects.append({"torque_limit": _FIRST_LIMIT_SHARE * largest})
+        effects.append({"static_friction": 0.5, "stribeck_speed": 1.0})
+        return effects
 
     def expand(self, z: Array) -> Array:
-        """Parameters of the replay."""
+        """Parameters of the replay in their units, (13,)."""
         p = z * self.scale
-        if self.duty is not None:
-            p[AT["torque_limit"]] = p[AT["position_gain"]] * self.duty
+        if self.limit_per_gain is not None:
+            p[INDEX["torque_limit"]] = p[INDEX["position_gain"]] * self.limit_per_gain
         if not self.split_damping:
-            damping = p[AT["motor_damping"]]
-            p[AT["motor_damping"]] = (1.0 - VISCOUS_SHARE) * damping
-            p[AT["viscous_friction"]] = VISCOUS_SHARE * damping
+            damping = p[INDEX["motor_damping"]]
+            p[INDEX["motor_damping"]] = (1.0 - VISCOUS_SHARE) * damping
+            p[INDEX["viscous_friction"]] = VISCOUS_SHARE * damping
         return p
 
     def residual(self, z: Array, thinned: bool = True) -> Array:
-        """Deviations at some or all rows [rad]."""
+        """Replayed less measured angles at some or all rows [rad], then the priors."""
         p = self.expand(z)
         parts = []
-        for one in self.replays:
-            every = max(1, len(one.log) // _MOST_ROWS) if thinned else 1
-            parts.append((one.play(p) - one.log.position)[::every])
+        for replay in self.replays:
+            every = max(1, len(replay.log) // _MOST_ROWS) if thinned else 1
+            parts.append((replay.play(p) - replay.log.position)[::every])
         if self.weight > 0.0:
-            parts.append(self.weight * self._prior(p))
+            parts.append(self.weight * self._prior_deviations(p))
         return np.nan_to_num(np.concatenate(parts), nan=10.0, posinf=10.0, neginf=-10.0)
 
-    def _prior(self, p: Array) -> Array:
-        """Deviations from what servos usually have, in standard deviations, (2,)."""
+    def _prior_deviations(self, p: Array) -> Array:
+        """Deviations of c and no-load speed from usual servos, in standard deviations, (2,)."""
         volts = max(log.supply for log in self.logs)
-        limit = p[AT["torque_limit"]]
-        damping = p[AT["motor_damping"]]
+        limit = p[INDEX["torque_limit"]]
+        damping = p[INDEX["motor_damping"]]
         speed = _NO_LOAD_SPEED
-        if 0.0 < limit < 1e3 * self.scale[AT["torque_limit"]] and damping > 0.0:
+        if 0.0 < limit < 1e3 * self.scale[INDEX["torque_limit"]] and damping > 0.0:
             speed = np.clip(limit * volts / damping, 0.1, 1e3)
-        loss = (p[AT["load_friction"]] - USUAL_LOSS[0]) / USUAL_LOSS[1]
-        return np.array([loss, np.log(speed / _NO_LOAD_SPEED) / _NO_LOAD_SPREAD])
+        loss = (p[INDEX["load_friction"]] - USUAL_LOSS[0]) / USUAL_LOSS[1]
+        return np.array([loss, np.log(speed / _NO_LOAD_SPEED) / _NO_LOAD_DEVIATION])
 
     def solve(self, z: Array, free: IntArray, evaluations: int) -> tuple[Array, float]:
-        """Least squares over some of the parameters, from a start."""
+        """Minimise the squared residuals over some of the parameters.
+
+        Args:
+            z: First parameters, in their scales, (13,).
+            free: Indices of the parameters to change.
+            evaluations: Limit of the solver's evaluations.
+
+        Returns:
+            Parameters in their scales, (13,), and the sum of squares.
+        """
         low = self.lower[free]
         high = self.upper[free]
 
-        def full(part: Array) -> Array:
-            whole = z.copy()
-            whole[free] = part
-            return whole
+        def merge(part: Array) -> Array:
+            merged = z.copy()
+            merged[free] = part
+            return merged
 
         def jacobian(part: Array) -> Array:
-            base = self.residual(full(part))
+            base = self.residual(merge(part))
             return np.stack(
                 [
-                    (self.residual(full(part + STEP * unit)) - base) / STEP
+                    (self.residual(merge(part + STEP * unit)) - base) / STEP
                     for unit in np.eye(len(part))
                 ],
                 axis=-1,
             )
 
-        start = np.clip(z[free], low + 1e-6, high - 1e-6)
-        found = least_squares(
-            lambda part: self.residual(full(part)),
-            start,
+        solution = least_squares(
+            lambda part: self.residual(merge(part)),
+            np.clip(z[free], low + 1e-6, high - 1e-6),
             jac=jacobian,  # pyright: ignore[reportArgumentType]
             bounds=(low, high),
             max_nfev=evaluations,
@@ -243,15 +261,15 @@ class ServoProblem:
             xtol=1e-6,
             ftol=1e-7,
         )
-        return full(found.x), 2.0 * float(found.cost)
+        return merge(solution.x), 2.0 * float(solution.cost)
 
 
 def prepare(log: ServoLog, longest_s: float = STEP_S) -> Replay:
-    """A log ready for replays; its first speed from its first rows."""
+    """Replay of a log that starts with angle and speed of the first rows."""
     speed, _ = log.derivatives()
-    if np.abs(speed[:FIRST_ROWS]).max() > _MOVING:
-        return Replay.of(log, float(speed[0]), longest_s=longest_s)
-    return Replay.of(log, 0.0, float(np.mean(log.position[:FIRST_ROWS])), longest_s)
+    if np.abs(speed[:FIRST_ROWS]).max() > MOVING:
+        return Replay.from_log(log, float(speed[0]), longest_s=longest_s)
+    return Replay.from_log(log, 0.0, float(np.mean(log.position[:FIRST_ROWS])), longest_s)
 
 
 def _switches(log: ServoLog) -> IntArray:
@@ -260,105 +278,32 @@ def _switches(log: ServoLog) -> IntArray:
 
 
 def _shortest_gap(logs: Sequence[ServoLog]) -> float:
-    """Time from the row before a switch of the torque to that after it, the shortest one [s]."""
+    """Shortest time between the rows before and after a switch of the torque [s]."""
     gaps = [np.diff(log.time)[_switches(log) - 1] for log in logs]
     return float(np.concatenate(gaps).min(initial=_LONGEST_LEAD_S))
 
 
-def duty_per_torque_gain(logs: Sequence[ServoLog]) -> float | None:
+def find_limit_per_gain(logs: Sequence[ServoLog]) -> float | None:
     """T/k, limit of the torque over the position gain, from logged PWM [rad]; None if unknown.
 
     The duty is proportional to g (goal − position) until it stays at its limit.
     """
-    rows = []
-    duty = []
+    with_pwm = [(log, log.pwm) for log in logs if log.pwm is not None]
     highest = 0.0
     at_limit = 0
-    for log in logs:
-        if log.pwm is None:
-            continue
-        highest = max(highest, float(np.abs(log.pwm).max()))
-        at_limit += int(np.sum(np.abs(log.pwm) > 0.999 * highest))
-    if highest == 0.0 or at_limit < _FEWEST_AT_LIMIT:
+    for _, pwm in with_pwm:
+        highest = max(highest, float(np.abs(pwm).max()))
+        at_limit += int(np.sum(np.abs(pwm) > 0.999 * highest))
+    if highest == 0.0 or at_limit < _FEWEST_ROWS_AT_LIMIT:
         return None
-    for log in logs:
-        if log.pwm is not None:
-            inner = log.enabled & (np.abs(log.pwm) < 0.98 * highest)
-            rows.append(log.register * (log.goal - log.position)[inner])
-            duty.append(log.pwm[inner])
-    error = np.concatenate(rows)
-    own = np.concatenate(duty)
-    slope = float(error @ own) / float(error @ error)
-    correlated = np.corrcoef(error, own)[0, 1] > _PROPORTIONAL
-    return highest / slope if slope > 0.0 and correlated else None
-
-
-def regress(problem: ServoProblem) -> Array:
-    """Parameters that solve the equation of motion where the joint moves, in their scales, (13,).
-
-    k g e − k c g e s σ − b w − B a − F s − d w − m g l o cos q = I a − τ(q), linear in k, k c, b,
-    B, F, d and o, for the error e, the side s of motion and the side σ of the motor's torque.
-
-    Raises:
-        ElasticError: The joint hardly moves.
-    """
-    rows = []
-    right = []
-    for log in problem.logs:
-        w, a = log.derivatives()
-        error = drive(log, problem.duty)
-        moving = np.abs(w) > _MOVING
-        side = np.sign(w)
-        lever = log.load.torque * np.cos(log.position - log.load.rest)
-        columns = [
-            error,
-            -error * side * np.sign(error),
-            -w * log.enabled,
-            -a,
-            -side,
-            -w * ~log.enabled,
-            lever,
-        ]
-        rows.append(np.stack(columns, axis=-1)[moving])
-        inertial = (log.load.inertia or 0.0) * a
-        right.append((inertial - log.external_torque(log.position))[moving])
-    matrix = np.concatenate(rows)
-    target = np.concatenate(right)
-    if len(target) < 2 * matrix.shape[1]:
-        raise ElasticError(
-            f"the joint moves in {len(target)} rows only, {2 * matrix.shape[1]} are needed: it"
-            " sticks or the goal hardly moves; command a motion of some tenths of a radian"
-        )
-    size = np.maximum(np.abs(matrix).max(axis=0), 1e-12)
-    low = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -np.inf])
-    solved = lsq_linear(matrix / size, target, (low, np.full(7, np.inf))).x / size
-    k, kc, b, B, F, d, offset = solved
-    has_inertia = all(log.load.inertia is not None for log in problem.logs)
-    found = {
-        "position_gain": k,
-        "motor_damping": b,
-        "rotor_inertia": B if has_inertia else 0.0,
-        "link_inertia": 0.0 if has_inertia else B,
-        "coulomb_friction": F,
-        "load_friction": np.clip(kc / k if k > 0.0 else 0.0, 0.0, 0.7),
-        "viscous_friction": d,
-        "stribeck_speed": 0.3,
-        "zero_offset": np.clip(offset, -0.1, 0.1),
-    }
-    z = np.array([found.get(name, 0.0) for name in NAMES]) / problem.scale
-    z[AT["torque_limit"]] = _NO_LIMIT
-    least = np.zeros(len(NAMES))
-    least[problem.always_sought] = _LEAST_START
-    least[AT["zero_offset"]] = -np.inf
-    return np.maximum(z, least)
-
-
-def drive(log: ServoLog, duty: float | None) -> Array:
-    """Torque of the motor at standstill over k, as `Replay` has it, (N,) [V·rad].
-
-    The register's error is limited before the supply's voltage scales it: the limit is T/k.
-    """
-    error = log.register * (log.goal - log.position)
-    if duty is not None:
-        error = np.clip(error, -duty, duty)
-    return error * log.supply * log.enabled
+    errors = []
+    duties = []
+    for log, pwm in with_pwm:
+        inner = log.enabled & (np.abs(pwm) < 0.98 * highest)
+        errors.append(log.register * (log.goal - log.position)[inner])
+        duties.append(pwm[inner])
+    error = np.concatenate(errors)
+    duty = np.concatenate(duties)
+    slope = float(error @ duty) / float(error @ error)
+    is_proportional = np.corrcoef(error, duty)[0, 1] > _LEAST_CORRELATION
+    return highest / slope if slope > 0.0 and is_proportional else None

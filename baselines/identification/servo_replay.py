@@ -12,11 +12,11 @@ F = F₀ + c |τ_J| + F_s exp(−(ω/ω_s)²). A DC motor under a voltage that t
 
 where V is the supply's voltage, k the position gain for one volt and one unit of the register g, T
 the torque at standstill for one volt, and b = k_t k_e / R the back-EMF's damping. Without torque
-enabled τ_m is zero, and the rotor's inertia stays. A program that switches the torque, then reads
+enabled τ_m is zero, and the rotor's inertia remains. A program that switches the torque, then reads
 the angle, logs the switch up to a row late: the torque changes a lead before the row.
 
-At rest friction balances whatever is not above F. So a joint at rest tells a band of torques, and
-motion tells the torque.
+At rest friction balances any torque up to F. So a joint at rest determines a band of torques, and
+motion determines the torque.
 """
 
 from dataclasses import dataclass
@@ -44,10 +44,11 @@ PARAMETERS = {
 }
 """Parameters of a servo with their units.
 
-Position gain and torque limit are for one volt, where voltages are known, and the gain for one unit
+Position gain and torque limit are for one volt, where voltages are known. The gain is for one unit
 of the servo's register.
 """
 NAMES = tuple(PARAMETERS)
+"""Order of the parameters in arrays."""
 
 STEP_S = 1.7e-3
 """Longest step of a replay [s]."""
@@ -55,34 +56,38 @@ STEP_S = 1.7e-3
 
 @dataclass(frozen=True)
 class Replay:
-    """A log on the grid of the simulation, made once for many replays.
+    """A log on the grid of the simulation, computed once for many replays.
 
     Attributes:
         log: The log.
         start: Angle and speed at the first row [rad], [rad/s].
         middle: Times of the middles of the steps, (N − 1, s) [s].
-        known: Known torque there, (N − 1, s) [N·m].
+        known_torque: Known torque at these times, (N − 1, s) [N·m].
     """
 
     log: ServoLog
     start: tuple[float, float]
     middle: Array
-    known: Array
+    known_torque: Array
 
     @staticmethod
-    def of(
+    def from_log(
         log: ServoLog, speed: float = 0.0, angle: float | None = None, longest_s: float = STEP_S
     ) -> "Replay":
-        """Prepare a log that begins with a speed [rad/s], and at its first or another angle [rad].
+        """Prepare a log.
 
-        Steps are at most `longest_s` long.
+        Args:
+            log: The log.
+            speed: Speed at the first row [rad/s].
+            angle: Angle at the first row [rad]; None for that of the log.
+            longest_s: Longest step [s].
         """
         step = np.diff(log.time)
         count = max(1, int(np.ceil(np.median(step) / longest_s)))
         middle = log.time[:-1, None] + step[:, None] * (np.arange(count) + 0.5) / count
         known = np.zeros_like(middle)
-        if log.known is not None:
-            known = np.interp(middle, log.time, log.known)
+        if log.known_torque is not None:
+            known = np.interp(middle, log.time, log.known_torque)
         angle = float(log.position[0]) if angle is None else angle
         return Replay(log, (angle, speed), middle, known)
 
@@ -96,19 +101,20 @@ class Replay:
         _play(
             np.diff(log.time),
             goal,
-            self.known,
+            self.known_torque,
             log.enabled,
-            self._switched(parameters[12]),
+            self._switched_shares(parameters[12]),
             np.array([*self.start, log.register, log.supply, load.torque, load.rest, inertia]),
             np.ascontiguousarray(parameters, dtype=np.float64),
             out,
         )
         return out
 
-    def _switched(self, lead: float) -> Array:
+    def _switched_shares(self, lead: float) -> Array:
         """Share of each step after the torque is switched, (N − 1, s); 0 where it is not.
 
-        It is switched a lead before the first row that says so, at most a row before [s].
+        Args:
+            lead: Time from the switch to the first row that contains it, at most a row [s].
         """
         step = np.diff(self.log.time)[:, None]
         count = self.middle.shape[1]
@@ -129,8 +135,8 @@ def _play(
 ) -> None:
     """Angles of the link at the rows, into `out`; second order in the step.
 
-    A link whose speed passes zero within a step stops there. For the rest of the step it stands, or
-    is driven the other way.
+    A link whose speed passes zero within a step stops there. For the rest of the step it stays at
+    rest, or is driven the other way.
     """
     q = setting[0]
     w = setting[1]
@@ -197,7 +203,7 @@ def _acceleration(
     M: float,
     B: float,
 ) -> float:
-    """Mean acceleration over a step of a link that moves to a side [rad/s²].
+    """Mean acceleration of a link over a step in which it moves to one side [rad/s²].
 
     M a = pull − b w̄ + other − d w̄ − s (F + c |pull − b w̄ − B a|), with w̄ = w + a h / 2, solved for
     the sign of the load that it then has.

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from baselines.identification.result_files import save_result
 from baselines.identification.servo_fit import ServoFit
 from baselines.identification.servo_holdout import ServoHoldout
 from baselines.identification.servo_log import ServoLog
@@ -15,14 +16,20 @@ from baselines.identification.servo_replay import PARAMETERS
 from elastic_env.core.config import Model
 from elastic_env.core.yaml_text import yaml_line
 
-_TOLD = 0.5
-_TOLD_WITHIN = {"zero_offset": 0.02, "delay": 0.005, "switch_lead": 0.005, "load_friction": 0.1}
-"""Half-widths at which a parameter counts as told whatever its value is."""
+_LARGEST_HALF_WIDTH = 0.5
+"""Half-width relative to the value up to which the logs determine a parameter."""
+_SMALL_HALF_WIDTHS = {
+    "zero_offset": 0.02,
+    "delay": 0.005,
+    "switch_lead": 0.005,
+    "load_friction": 0.1,
+}
+"""Half-widths at which the logs determine a parameter of any value."""
 _FRICTION = ("coulomb_friction", "viscous_friction", "load_friction", "static_friction")
 _SAME_SUPPLY = 0.1
-"""Share of a voltage within which logs have one supply."""
-_SMALL_SHARE = 0.02
-"""Share of the largest load below which a dry friction is as good as told."""
+"""Relative difference of voltages within which logs have one supply."""
+_SMALL_FRICTION_SHARE = 0.02
+"""Half-width over the largest load at which the logs determine a dry friction of any value."""
 
 
 class ServoParameter(Model):
@@ -31,11 +38,11 @@ class ServoParameter(Model):
     name: str
     unit: str
     value: float | None = None
-    """None where it was not sought."""
+    """None without an estimate."""
     half_width: float | None = None
-    """Half of the interval; None where it follows from an assumption, or was not sought."""
+    """Half of the interval; None where the value follows from an assumption, or is None."""
     is_told: bool
-    """True if the logs tell it, to half its value or better."""
+    """True if the logs determine it, to half its value or better."""
     remark: str = ""
 
 
@@ -43,12 +50,12 @@ class RegisterGain(Model):
     """Position gain of the servo at one value of its gain register."""
 
     register_value: float | None
-    """None where the logs do not say it."""
+    """None where the logs do not contain it."""
     position_gain_nm_per_rad: float
     half_width: float | None
-    """Half of the 95 % interval; None where the logs do not tell the gain."""
+    """Half of the 95 % interval; None where the logs do not determine the gain."""
     supply_v: float | None = None
-    """Voltage at which the servo has this gain; None where the logs do not say it."""
+    """Voltage at which the servo has this gain; None where the logs do not contain it."""
 
 
 class ServoIdentification(Model):
@@ -58,63 +65,60 @@ class ServoIdentification(Model):
     logs: tuple[str, ...]
     rows: int
     rms_mrad: float
-    """Of the replay at the logs that were fitted."""
+    """Root mean square deviation of the replay from the fitted logs."""
     gains: tuple[RegisterGain, ...]
     parameters: tuple[ServoParameter, ...]
     untold: tuple[str, ...]
-    """What the logs cannot tell, in words."""
+    """Sentences on what the logs do not determine."""
     supply_v: float | None
     """Voltage of the position gain and the torque limit among the parameters."""
     held_out: ServoHoldout | None = None
 
     def value(self, name: str) -> float | None:
         """An estimate by its name, as in `servo_replay.NAMES`."""
-        return next(one.value for one in self.parameters if one.name == name)
+        return next(parameter.value for parameter in self.parameters if parameter.name == name)
 
     def settings(self) -> dict[str, Any]:
-        """The joint as `JointSettings` takes it; of the first gain, without a spring."""
-        own: dict[str, Any] = {"stiffness": math.inf}
+        """Settings of the joint for `JointSettings`, with the first gain and without a spring."""
+        settings: dict[str, Any] = {"stiffness": math.inf}
         inertia = self.value("rotor_inertia")
         if inertia:
-            own["rotor_inertia"] = _rounded(inertia)
-        own |= {name: _rounded(self.value(name) or 0.0) for name in _FRICTION}
-        if own["static_friction"]:
-            own["stribeck_speed"] = _rounded(self.value("stribeck_speed") or 0.0)
+            settings["rotor_inertia"] = _four_digits(inertia)
+        settings |= {name: _four_digits(self.value(name) or 0.0) for name in _FRICTION}
+        if settings["static_friction"]:
+            settings["stribeck_speed"] = _four_digits(self.value("stribeck_speed") or 0.0)
         if self.gains:
-            own["servo"] = {
-                "position_gain": _rounded(self.gains[0].position_gain_nm_per_rad),
-                "velocity_gain": _rounded(self.value("motor_damping") or 0.0),
+            settings["servo"] = {
+                "position_gain": _four_digits(self.gains[0].position_gain_nm_per_rad),
+                "velocity_gain": _four_digits(self.value("motor_damping") or 0.0),
             }
             limit = self.value("torque_limit")
             if limit is not None:
-                own["servo"]["torque_limit"] = _rounded(limit)
-        return own
+                settings["servo"]["torque_limit"] = _four_digits(limit)
+        return settings
 
     def save(self, folder: Path) -> list[Path]:
         """Write `identification.json` and `joints.yaml`."""
-        files = [folder / name for name in ("identification.json", "joints.yaml")]
-        files[0].write_text(self.model_dump_json(indent=2) + "\n", encoding="utf-8")
         head = "# by elastic identify from logs in time; the logs do not tell the gear's stiffness"
-        said = "no servo"
+        comment = "no servo"
         if self.gains:
             volts = self.gains[0].supply_v
-            at = "" if volts is None else f" at {volts:g} V"
+            supply = "" if volts is None else f" at {volts:g} V"
             register = self.gains[0].register_value
-            said = f"gain register {'as in the logs' if register is None else f'{register:g}'}{at}"
-        text = f"{head}\n{yaml_line(self.joint, self.settings(), said)}\n"
-        files[1].write_text(text, encoding="utf-8")
-        return files
+            value = "as in the logs" if register is None else f"{register:g}"
+            comment = f"gain register {value}{supply}"
+        return save_result(self, folder, head, [yaml_line(self.joint, self.settings(), comment)])
 
 
 def describe_servo(
     fit: ServoFit, joint: str = "*", held_out: ServoHoldout | None = None
 ) -> ServoIdentification:
-    """The result of a fit.
+    """Result of a fit.
 
     Args:
         fit: A fit to all logs.
         joint: Name for `joints.yaml`, or a pattern.
-        held_out: Errors of another fit at logs that it did not see.
+        held_out: Errors of another fit at logs that it did not use.
     """
     registers = _registers(fit.logs)
     supply = registers[0][1] if registers else fit.logs[0].supply
@@ -136,7 +140,7 @@ def describe_servo(
             for register, volts in registers
         ),
         parameters=parameters,
-        untold=tuple(_untold(fit, parameters)),
+        untold=tuple(_undetermined_quantities(fit, parameters)),
         supply_v=None if supply == 1.0 else supply,
         held_out=held_out,
     )
@@ -147,89 +151,91 @@ def _registers(logs: Sequence[ServoLog]) -> list[tuple[float | None, float]]:
 
     Voltages that were measured differ a little from log to log, and count as one supply.
     """
-    found: list[tuple[float | None, list[float]]] = []
+    groups: list[tuple[float | None, list[float]]] = []
     for log in logs:
         if not log.enabled.any():
             continue
         alike = [
             volts
-            for register, volts in found
+            for register, volts in groups
             if register == log.gain and abs(log.supply / volts[0] - 1.0) < _SAME_SUPPLY
         ]
         if alike:
             alike[0].append(log.supply)
         else:
-            found.append((log.gain, [log.supply]))
-    return [(register, float(np.mean(volts))) for register, volts in found]
+            groups.append((log.gain, [log.supply]))
+    return [(register, float(np.mean(volts))) for register, volts in groups]
 
 
 def _parameter(fit: ServoFit, name: str, supply: float) -> ServoParameter:
+    """Result of one parameter at the voltage of a supply [V]."""
     scale = supply if name in ("position_gain", "torque_limit") else 1.0
     value = fit.value(name) * scale
     half = fit.half(name) * scale
-    is_known = name in fit.tied or bool(fit.sought[list(PARAMETERS).index(name)])
-    if not is_known or not np.isfinite(value):
+    has_value = name in fit.tied or bool(fit.is_estimated[list(PARAMETERS).index(name)])
+    if not has_value or not np.isfinite(value):
         return ServoParameter(name=name, unit=PARAMETERS[name], is_told=False)
     has_interval = bool(np.isfinite(half))
-    within = _TOLD_WITHIN.get(name, 0.0)
+    small = _SMALL_HALF_WIDTHS.get(name, 0.0)
     if name in ("coulomb_friction", "static_friction"):
-        within = _SMALL_SHARE * max(
+        small = _SMALL_FRICTION_SHARE * max(
             float(np.abs(log.external_torque(log.position)).max()) for log in fit.logs
         )
-    told = has_interval and half <= max(_TOLD * abs(value), within)
     return ServoParameter(
         name=name,
         unit=PARAMETERS[name],
         value=value,
         half_width=half if has_interval else None,
-        is_told=told,
+        is_told=has_interval and half <= max(_LARGEST_HALF_WIDTH * abs(value), small),
         remark=fit.tied.get(name, ""),
     )
 
 
-def _untold(fit: ServoFit, parameters: Sequence[ServoParameter]) -> list[str]:
-    """What the logs cannot tell, each with its reason and its cure."""
-    said = []
+def _undetermined_quantities(fit: ServoFit, parameters: Sequence[ServoParameter]) -> list[str]:
+    """Quantities that the logs do not determine, each with its reason and its cure."""
+    lines = []
     has_torque = any(log.enabled.any() for log in fit.logs)
     if not has_torque:
-        said.append("the servo: its torque is never on")
+        lines.append("the servo: its torque is never on")
     elif all(log.gain is None for log in fit.logs):
-        said.append(
+        lines.append(
             "at which value of the gain register k_p holds: log a column gain, or say it by --gain"
         )
     if has_torque and "viscous_friction" in fit.tied:
-        said.append(
+        lines.append(
             f"viscous friction apart from the motor's back-EMF ({fit.tied['viscous_friction']}):"
             " log a swing with the torque off"
         )
-    by_name = {one.name: one for one in parameters}
+    by_name = {parameter.name: parameter for parameter in parameters}
+    estimated = [parameter for parameter in parameters if parameter.value is not None]
     if has_torque and by_name["torque_limit"].value is None:
-        said.append("the torque limit: the servo never reaches it; log a fast motion or the PWM")
+        lines.append("the torque limit: the servo never reaches it; log a fast motion or the PWM")
     wide = [
-        f"{one.name} (± {one.half_width:.2g} {one.unit})"
-        for one in parameters
-        if one.value is not None and one.half_width is not None and not one.is_told
+        f"{parameter.name} (± {parameter.half_width:.2g} {parameter.unit})"
+        for parameter in estimated
+        if parameter.half_width is not None and not parameter.is_told
     ]
     if wide:
-        said.append(
+        lines.append(
             f"with less than half their value: {', '.join(wide)}; log faster motions, both sides of"
             " approach, and a swing with the torque off"
         )
-    without = [
-        one.name for one in parameters if one.value is not None and np.isinf(fit.half(one.name))
+    without_influence = [
+        parameter.name for parameter in estimated if np.isinf(fit.half(parameter.name))
     ]
-    if without:
-        said.append(f"{', '.join(without)}: nothing in these logs depends on it alone")
+    if without_influence:
+        lines.append(f"{', '.join(without_influence)}: nothing in these logs depends on it alone")
     if by_name["static_friction"].value is None:
-        said.append("Stribeck friction: it does not lower the error")
-    if fit.half("load_friction") > _TOLD * USUAL_LOSS[1]:
-        said.append(
+        lines.append("Stribeck friction: it does not lower the error")
+    if fit.half("load_friction") > _LARGEST_HALF_WIDTH * USUAL_LOSS[1]:
+        lines.append(
             f"load friction without its prior of {USUAL_LOSS[0]} ± {USUAL_LOSS[1]}: let the load"
             " drive the joint back slowly"
         )
-    said.append("stiffness and backlash of the gear: one encoder shows one side of it only")
-    return said
+    lines.append("stiffness and backlash of the gear: one encoder shows one side of it only")
+    return lines
 
 
-def _rounded(value: float) -> float:
+def _four_digits(value: float) -> float:
+    """A value that is not negative, as `joints.yaml` contains it."""
     return float(f"{max(value, 0.0):.4g}")

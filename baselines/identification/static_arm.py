@@ -14,18 +14,19 @@ from elastic_env.joint.model_joints import held_positions
 from elastic_env.rigid.tree.end_effector import EndEffector, outermost_body, site_or_body
 from elastic_env.world.robot_model import joint_ranges
 
-_STEP_RAD = 1e-4  # of central differences: an error of 1e-9 relative
+_STEP_RAD = 1e-4
+"""Step of central differences, for a relative error of 1e-9."""
 
 
 @dataclass(frozen=True)
 class Attitude:
-    """Poses of a body or site, and how they change with the joints.
+    """Poses of a body or site, and their derivatives by the joint angles.
 
     Attributes:
-        position: In the model's world frame, (N, 3) [m].
-        rotation: From its frame to the world's, (N, 3, 3).
-        position_gradient: (N, 3, n) [m/rad].
-        rotation_gradient: Of the angular velocity by the joint rates, (N, 3, n).
+        position: Position in the model's world frame, (N, 3) [m].
+        rotation: Rotation from its frame to the world's, (N, 3, 3).
+        position_gradient: Derivatives of the position, (N, 3, n) [m/rad].
+        rotation_gradient: Derivatives of the angular velocity by the joint rates, (N, 3, n).
     """
 
     position: Array
@@ -62,8 +63,7 @@ class StaticArm:
             )
         self.model = model
         self.joints = tuple(joints)
-        # rigid: it lends its torque, in which springs, `gravcomp` and held joints are taken into
-        # account
+        # only for its torque, which takes springs, `gravcomp` and held joints into account
         self._bare = PositionCompensator(model, np.inf, joints=joints).constants.body
         self._loaded = None
         if payload is not None:
@@ -72,7 +72,7 @@ class StaticArm:
             loaded.set_payload(1.0, place, model.body(body).name)
             self._loaded = loaded.constants.body
         if end_effector is not None:
-            site_or_body(model, end_effector)  # a name is checked although not all logs need it
+            site_or_body(model, end_effector)  # checks the name, although not all logs need it
         self._end_effector = end_effector
         self.ranges = np.column_stack(joint_ranges(model, joints))
 

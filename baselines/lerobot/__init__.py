@@ -1,7 +1,7 @@
 """Arms that LeRobot commands: its units and calibration, its processor steps, its recordings.
 
 `baselines.lerobot.steps` needs the package lerobot, and registers its steps when it is imported.
-The other modules need neither it nor torch.
+The other modules need neither lerobot nor torch.
 """
 
 from baselines.lerobot.arm import JointUnits, LeRobotArm

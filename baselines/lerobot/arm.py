@@ -11,10 +11,10 @@ range     −100 to 100 over the calibrated range    value (max − min)/200 · 
 percent   0 to 100 over it                         (value − 50)(max − min)/100 · 2π/N
 ========  =======================================  ==============================
 
-Two entries of the calibration do not enter. `homing_offset` is in the motor's register, so that
-counts have it already. `drive_mode` turns the sign of values on Feetech's bus, outside of degrees;
-angles here have the sign of the value, whatever it came from. Motors without counts (Damiao) are
-read in degrees from their own zero. All this is `MotorsBus._normalize` of lerobot 0.4.4,
+Two entries of the calibration are not used. `homing_offset` is in the motor's register, so that
+counts already include it. `drive_mode` reverses the sign of values on Feetech's bus, except in
+degrees; angles here always have the sign of the value. Motors without counts (Damiao) are read in
+degrees from their own zero. All this is `MotorsBus._normalize` of lerobot 0.4.4,
 `src/lerobot/motors/motors_bus.py`.
 
 Where a joint of the model is at q, LeRobot's angle is direction · q + `zero_rad`.
@@ -39,6 +39,7 @@ from elastic_env.joint.model_file import compiled_model
 from elastic_env.joint.model_joints import hinges_of
 
 _CENTRE = {"degrees": 0.0, "range": 0.0, "percent": 50.0}
+"""Value in the middle of the calibrated range."""
 _WIDTH = {"range": 200.0, "percent": 100.0}
 """Values from one end of the calibrated range to the other."""
 
@@ -48,12 +49,12 @@ class JointUnits:
     """Angle = slope · (value − centre) + offset, for n joints.
 
     Attributes:
-        slope: Angle of the joint per unit of LeRobot's value, negative where it runs against it,
-            (n,) [rad].
+        slope: Angle of the joint per unit of LeRobot's value, negative where both have opposite
+            signs, (n,) [rad].
         centre: Value in the middle of the calibrated range, (n,).
-        offset: Angle of the model's joint there, (n,) [rad].
-        lowest: Least value that LeRobot takes, infinite without a range, (n,).
-        highest: Largest one.
+        offset: Angle of the model's joint at this value, (n,) [rad].
+        lowest: Least value that LeRobot accepts, infinite without a range, (n,).
+        highest: Largest value that LeRobot accepts, infinite without a range, (n,).
     """
 
     slope: Array
@@ -67,7 +68,7 @@ class JointUnits:
         return self.slope * (value - self.centre) + self.offset
 
     def value(self, angle: Array) -> Array:
-        """LeRobot's values for angles, (..., n) [rad]; not cut to its ranges."""
+        """LeRobot's values for angles, (..., n) [rad]; not clipped to its ranges."""
         return (angle - self.offset) / self.slope + self.centre
 
     @property
@@ -86,68 +87,68 @@ def units_of(
 
     Args:
         motors: Motors with their units.
-        places: What each of them moves.
-        calibration: By the names of motors; those without counts need none.
+        places: Joint that each of them moves.
+        calibration: Calibration by the names of motors; motors without counts need none.
 
     Raises:
         ConfigurationError: A motor has no calibration.
     """
     rows = [
-        _row(motor, place, calibration.get(motor.name))
+        _motor_units(motor, place, calibration.get(motor.name))
         for motor, place in zip(motors, places, strict=True)
     ]
     slope, centre, offset, lowest, highest = np.array(rows).T
     return JointUnits(slope, centre, offset, lowest, highest)
 
 
-def _row(
-    motor: Motor, place: JointPlace, known: MotorCalibration | None
+def _motor_units(
+    motor: Motor, place: JointPlace, calibration: MotorCalibration | None
 ) -> tuple[float, float, float, float, float]:
     """Slope, centre, offset, lowest and highest value of a motor."""
-    turn = math.radians(1.0)
+    per_value = math.radians(1.0)
     lowest = -math.inf
     highest = math.inf
     centre = _CENTRE[motor.units]
     if motor.counts_per_turn is not None:
-        if known is None:
+        if calibration is None:
             raise ConfigurationError(
                 f"the calibration lacks the motor {motor.name!r}; give the JSON file that LeRobot"
                 " wrote for this arm"
             )
-        span = known.range_max - known.range_min
+        span = calibration.range_max - calibration.range_min
         per_count = 2.0 * math.pi / motor.counts_per_turn
         if motor.units == "degrees":
-            turn *= (motor.counts_per_turn - 1) / motor.counts_per_turn
-            highest = 0.5 * span * per_count / turn
+            per_value *= (motor.counts_per_turn - 1) / motor.counts_per_turn
+            highest = 0.5 * span * per_count / per_value
             lowest = -highest
         else:
             width = _WIDTH[motor.units]
-            turn = span * per_count / width
+            per_value = span * per_count / width
             lowest = centre - 0.5 * width
             highest = centre + 0.5 * width
     offset = -place.direction * place.zero_rad
-    return place.direction * turn, centre, offset, lowest, highest
+    return place.direction * per_value, centre, offset, lowest, highest
 
 
-_FAR_RAD = 0.35
-"""Distance from which the middle of a calibrated range is not that of the model's range."""
-_TURN_RAD = 6.0
-"""Width from which a calibrated range is a whole turn, and not that of the joint."""
-_BEYOND = 1.3
-"""Share of LeRobot's range beyond which the first value has another unit."""
+_LARGEST_MIDDLE_ERROR_RAD = 0.35
+"""Largest distance between the middles of a calibrated range and of the model's range."""
+_WHOLE_TURN_RAD = 6.0
+"""Width from which a calibrated range is a whole turn, and not the range of the joint."""
+_LARGEST_RANGE_RATIO = 1.3
+"""Ratio of the first value to LeRobot's range above which the value has another unit."""
 
 
 class LeRobotArm:
-    """Compensates what LeRobot sends to an arm, and corrects what it reads.
+    """Compensates the actions that LeRobot sends to an arm, and corrects its observations.
 
-    Motors that move no joint of the model keep their values, and so do the gripper, unless a place
-    says which joint it moves, and the motors of joints that are held.
+    Some motors keep their values: motors that move no joint of the model, motors of joints that are
+    held, and the gripper, unless `places` gives the joint that it moves.
 
     Attributes:
-        settings: With the content of the files of joints and calibration in place of their names.
-        compensator: In rad, for the joints of `motors`.
+        settings: Settings with the content of the files of joints and calibration.
+        compensator: Compensator in rad, for the joints of `motors`.
         motors: Names of the motors that are compensated, as in actions, (n,).
-        units: LeRobot's values and angles of these.
+        units: LeRobot's values and angles of these motors.
 
     Args:
         settings: The arm.
@@ -156,8 +157,8 @@ class LeRobotArm:
         ConfigurationError: A file, a name or a value cannot be used.
 
     Warns:
-        UserWarning: The calibrated range of a motor is far from the middle of its joint's range; or
-            as `PositionCompensator` says.
+        UserWarning: The middle of a motor's calibrated range is far from the middle of its joint's
+            range; or a reason of `PositionCompensator`.
     """
 
     def __init__(self, settings: ArmSettings) -> None:
@@ -166,10 +167,11 @@ class LeRobotArm:
         content = read_mapping(Path(joints)) if isinstance(joints, str) else joints
         self.settings = settings.replace(calibration=calibration, joints=_without_infinity(content))
         model = compiled_model(settings.model)
-        moved = _moved(settings, hinges_of(model), content)
-        self.motors = tuple(f"{settings.prefix}{motor.name}" for motor, _ in moved)
-        places = [place for _, place in moved]
-        self.units = units_of([motor for motor, _ in moved], places, calibration)
+        pairs = _compensated_motors(settings, hinges_of(model), content)
+        motors = [motor for motor, _ in pairs]
+        places = [place for _, place in pairs]
+        self.motors = tuple(f"{settings.prefix}{motor.name}" for motor in motors)
+        self.units = units_of(motors, places, calibration)
         self.compensator = PositionCompensator(
             model,
             content,
@@ -185,53 +187,53 @@ class LeRobotArm:
         self._warn_of_zeros(places)
 
     def reset(self) -> None:
-        """Begin anew: the ramp starts at zero."""
+        """Restart the ramp at zero."""
         self.compensator.reset()
 
     def command(self, action: Mapping[str, Any]) -> dict[str, Any]:
-        """Action that brings the links to where an action wants them.
+        """Action that brings the links to the positions of an action.
 
         Args:
-            action: Values by names such as elbow_flex.pos; others are handed on.
+            action: Values by names such as elbow_flex.pos; other entries are passed on.
 
         Returns:
-            The same with compensated values, within LeRobot's ranges.
+            The same entries with compensated values, within LeRobot's ranges.
 
         Raises:
             ActionError: A value is missing, or no finite number, or the first one has another unit;
                 nothing changes.
         """
-        wanted = self._values("action", action)
-        found = self.units.value(self.compensator.command(self.units.angle(wanted)))
-        within = np.clip(found, self.units.lowest, self.units.highest)
-        return {**action, **dict(zip(self._keys, within.tolist(), strict=True))}
+        desired = self._values("action", action)
+        commanded = self.units.value(self.compensator.command(self.units.angle(desired)))
+        clipped = np.clip(commanded, self.units.lowest, self.units.highest)
+        return {**action, **dict(zip(self._keys, clipped.tolist(), strict=True))}
 
     def link_angles(self, observation: Mapping[str, Any]) -> dict[str, Any]:
-        """Observation with the angles of the links in the place of those of the encoders, at rest.
+        """Observation with the angles of the links instead of those of the encoders, at rest.
 
-        Arguments, result and errors are as of `command`.
+        Arguments, result and errors are those of `command`.
 
         Raises:
             ElasticError: The load overcomes a spring.
         """
-        shown = self._values("observation", observation)
-        found = self.units.value(self.compensator.link_angle(self.units.angle(shown)))
-        return {**observation, **dict(zip(self._keys, found.tolist(), strict=True))}
+        measured = self._values("observation", observation)
+        links = self.units.value(self.compensator.link_angle(self.units.angle(measured)))
+        return {**observation, **dict(zip(self._keys, links.tolist(), strict=True))}
 
-    def _values(self, what: str, given: Mapping[str, Any]) -> Array:
-        """Values of the motors, (n,)."""
-        missing = [key for key in self._keys if key not in given]
+    def _values(self, kind: str, entries: Mapping[str, Any]) -> Array:
+        """Values of the motors in an action or observation, (n,)."""
+        missing = [key for key in self._keys if key not in entries]
         if missing:
             raise ActionError(
-                f"the {what} lacks {missing[0]!r}: put this step where LeRobot has the positions of"
-                f" motors, it has {quote(list(given))}"
+                f"the {kind} lacks {missing[0]!r}: put this step where LeRobot has the positions of"
+                f" motors, it has {quote(list(entries))}"
             )
         try:
-            values = np.array([float(given[key]) for key in self._keys])
+            values = np.array([float(entries[key]) for key in self._keys])
         except (TypeError, ValueError):
             raise ActionError(
-                f"the {what} must hold numbers at {', '.join(self._keys)}, got"
-                f" {quote([given[key] for key in self._keys])}"
+                f"the {kind} must hold numbers at {', '.join(self._keys)}, got"
+                f" {quote([entries[key] for key in self._keys])}"
             ) from None
         if not self._is_checked:
             self._require_units(values)
@@ -241,9 +243,9 @@ class LeRobotArm:
     def _require_units(self, values: Array) -> None:
         """Refuse values that are so far beyond LeRobot's range that they have another unit."""
         middle = self.units.centre
-        beyond = np.abs(values - middle) / (self.units.highest - middle)
-        worst = int(np.argmax(beyond))
-        if beyond[worst] > _BEYOND:
+        ratio = np.abs(values - middle) / (self.units.highest - middle)
+        worst = int(np.argmax(ratio))
+        if ratio[worst] > _LARGEST_RANGE_RATIO:
             raise ActionError(
                 f"{self._keys[worst]} is {values[worst]:.4g}, and LeRobot's range is"
                 f" {self.units.lowest[worst]:.4g} to {self.units.highest[worst]:.4g}: say"
@@ -251,13 +253,13 @@ class LeRobotArm:
             )
 
     def _warn_of_zeros(self, places: Sequence[JointPlace]) -> None:
-        """Warn of calibrated ranges that do not lie over the model's."""
+        """Warn of calibrated ranges whose middles differ from those of the model's ranges."""
         lower, upper = self.units.ends
-        known = self.compensator.constants
-        middle = 0.5 * (known.lowest + known.highest)
-        off = np.abs(self.units.offset - middle)
-        has_range = np.isfinite(off) & (upper - lower < _TURN_RAD)
-        for joint in np.flatnonzero(has_range & (off > _FAR_RAD)):
+        constants = self.compensator.constants
+        middle = 0.5 * (constants.lowest + constants.highest)
+        error = np.abs(self.units.offset - middle)
+        has_range = np.isfinite(error) & (upper - lower < _WHOLE_TURN_RAD)
+        for joint in np.flatnonzero(has_range & (error > _LARGEST_MIDDLE_ERROR_RAD)):
             place = places[int(joint)]
             warnings.warn(
                 f"LeRobot's zero of {self.motors[joint]} is the middle of the calibrated range, and"
@@ -267,11 +269,11 @@ class LeRobotArm:
             )
 
 
-def _moved(
+def _compensated_motors(
     settings: ArmSettings, hinges: Sequence[str], content: Any
 ) -> list[tuple[Motor, JointPlace]]:
     """Motors that are compensated, with the joints that they move."""
-    found: list[tuple[Motor, JointPlace]] = []
+    pairs: list[tuple[Motor, JointPlace]] = []
     for motor in settings.motors:
         default = None if motor.name == GRIPPER else JointPlace()
         place = settings.places.get(motor.name, default)
@@ -288,13 +290,13 @@ def _moved(
                 f" {choices_listed(joint, hinges)}"
             )
         if not _is_held(content, joint):
-            found.append((motor, place.replace(joint=joint)))
-    names = [place.joint for _, place in found]
-    if twice := [name for name in names if names.count(name) > 1]:
-        raise ConfigurationError(f"two motors move the joint {twice[0]!r}; correct `places`")
-    if not found:
+            pairs.append((motor, place.replace(joint=joint)))
+    names = [place.joint for _, place in pairs]
+    if repeated := [name for name in names if names.count(name) > 1]:
+        raise ConfigurationError(f"two motors move the joint {repeated[0]!r}; correct `places`")
+    if not pairs:
         raise ConfigurationError("no motor is left to compensate; correct `places` or `joints`")
-    return found
+    return pairs
 
 
 def _is_held(content: Any, joint: str) -> bool:
@@ -305,7 +307,7 @@ def _is_held(content: Any, joint: str) -> bool:
 
 
 def _without_infinity(content: Any) -> Any:
-    """Content of a file of joints for JSON, which knows no infinite number."""
+    """Content of a file of joints for JSON, which has no infinite numbers."""
     if isinstance(content, Mapping):
         return {str(key): _without_infinity(value) for key, value in content.items()}
     return RIGID if content == np.inf else content

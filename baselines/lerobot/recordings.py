@@ -1,7 +1,7 @@
 """LeRobot's data sets as logs in time of single joints, which `elastic identify --log` reads.
 
-A data set is a folder: `meta/info.json` names the columns, and `data/**/*.parquet` has the rows, an
-episode a file (v2.1) or several (v3.0). Pictures are not read.
+A data set is a folder: `meta/info.json` names the columns, and `data/**/*.parquet` has the rows. A
+file has one episode (v2.1) or several (v3.0). Pictures are not read.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -20,14 +20,15 @@ from elastic_env.core.errors import ConfigurationError, list_names, shorten
 from elastic_env.core.signals import Array
 
 _MOST_BYTES = 200_000_000
-"""Of a file of rows; LeRobot begins another one at 100 MB."""
+"""Largest size of a file of rows; LeRobot starts another file at 100 MB."""
 _OLD_PREFIX = "main_"
-"""Before the motors' names in data sets of 2024."""
+"""Prefix of the motors' names in data sets of 2024."""
 _FEWEST_ROWS = 3
-"""Rows of an episode that tell an acceleration."""
+"""Rows of an episode that give an acceleration."""
 _LONGEST_GAP = 1000
-_KINDS = {"so_follower": "so101_follower"}
-"""Names of data sets for robots with the same motors."""
+"""Longest time between two rows, in usual steps."""
+_ROBOT_TYPES = {"so_follower": "so101_follower"}
+"""Types of robots with the same motors, by their names in data sets."""
 
 
 @dataclass(frozen=True)
@@ -35,11 +36,11 @@ class Recording:
     """An episode in LeRobot's own values.
 
     Attributes:
-        episode: Its number.
+        episode: Number of the episode.
         motors: Names of the motors that have a goal and a position, (n,).
-        time: Since its begin, (N,) [s].
-        goal: Of these motors, (N, n).
-        position: Likewise.
+        time: Time since the start of the episode, (N,) [s].
+        goal: Goals of these motors, (N, n).
+        position: Positions of these motors, (N, n).
     """
 
     episode: int
@@ -53,49 +54,48 @@ def robot_of(folder: Path) -> str:
     """Type of the robot that a data set names.
 
     Raises:
-        ConfigurationError: The folder is no data set, or names none.
+        ConfigurationError: The folder is no data set, or names no robot.
     """
-    found = _info(folder).get("robot_type")
-    if not isinstance(found, str) or not found:
-        raise ConfigurationError(f"{shorten(folder)} names no robot; say it by --robot")
-    name = found if found.endswith("_follower") else f"{found}_follower"
-    return _KINDS.get(name, name)
+    robot = _read_info(folder).get("robot_type")
+    if not isinstance(robot, str) or not robot:
+        raise ConfigurationError(f"{shorten(folder)} names no robot; name it by --robot")
+    name = robot if robot.endswith("_follower") else f"{robot}_follower"
+    return _ROBOT_TYPES.get(name, name)
 
 
 def read_recordings(folder: Path, episodes: Sequence[int] = ()) -> list[Recording]:
-    """Episodes of a data set.
+    """Read episodes of a data set.
 
     Args:
-        folder: Of the data set.
-        episodes: Their numbers; empty for all.
+        folder: Folder of the data set.
+        episodes: Numbers of the episodes; empty for all.
 
     Raises:
         ConfigurationError: The folder is no data set, or an episode is not in it.
     """
-    info = _info(folder)
-    goals = _motors(folder, info, "action")
-    positions = _motors(folder, info, "observation.state")
+    info = _read_info(folder)
+    goals = _motor_columns(folder, info, "action")
+    positions = _motor_columns(folder, info, "observation.state")
     motors = tuple(name for name in goals if name in positions)
     if not motors:
         raise ConfigurationError(
             f"{shorten(folder)} has no motor with an action and a position; its actions are"
             f" {list_names(goals)}"
         )
-    files = sorted((folder / "data").rglob("*.parquet"))
-    found: list[Recording] = []
-    for file in files:
-        found += _episodes(file, motors, goals, positions, episodes)
-    found.sort(key=lambda one: one.episode)
-    known = {one.episode for one in found}
-    missing = [f"episode {episode}" for episode in episodes if episode not in known]
-    if missing or not found:
-        which = missing[0] if missing else "episodes"
-        raise ConfigurationError(f"{shorten(folder)} has no {which} in its folder data")
-    return found
+    recordings: list[Recording] = []
+    for file in sorted((folder / "data").rglob("*.parquet")):
+        recordings += _read_file(file, motors, goals, positions, episodes)
+    recordings.sort(key=lambda recording: recording.episode)
+    present = {recording.episode for recording in recordings}
+    missing = [f"episode {episode}" for episode in episodes if episode not in present]
+    if missing or not recordings:
+        what = missing[0] if missing else "episodes"
+        raise ConfigurationError(f"{shorten(folder)} has no {what} in its folder data")
+    return recordings
 
 
 def joint_logs(recording: Recording, arm: LeRobotArm) -> list[ServoLog]:
-    """Logs of the joints of an arm, in rad, with the torque that its model knows.
+    """Logs of the joints of an arm, in rad, with the torque by its model.
 
     Args:
         recording: An episode.
@@ -103,7 +103,7 @@ def joint_logs(recording: Recording, arm: LeRobotArm) -> list[ServoLog]:
 
     Returns:
         A log JOINT_EPISODE for each joint, with the inertia of the links about it, mean over the
-        rows. Known is the torque of weight and of the other joints' motion.
+        rows. The known torque is that of weight and of the other joints' motion.
 
     Raises:
         ConfigurationError: The episode lacks a motor of the arm.
@@ -113,9 +113,9 @@ def joint_logs(recording: Recording, arm: LeRobotArm) -> list[ServoLog]:
             f"episode {recording.episode} has no motor {missing[0]!r}; it has"
             f" {list_names(recording.motors)}"
         )
-    at = [recording.motors.index(name) for name in arm.motors]
-    goal = arm.units.angle(recording.goal[:, at])
-    position = arm.units.angle(recording.position[:, at])
+    columns = [recording.motors.index(name) for name in arm.motors]
+    goal = arm.units.angle(recording.goal[:, columns])
+    position = arm.units.angle(recording.position[:, columns])
     inertia, known = known_loads(arm.compensator.constants.body, recording.time, position)
     return [
         ServoLog(
@@ -125,14 +125,14 @@ def joint_logs(recording: Recording, arm: LeRobotArm) -> list[ServoLog]:
             position=position[:, joint],
             enabled=np.ones(len(goal), dtype=np.bool_),
             load=Load(inertia=float(inertia[joint])),
-            known=known[:, joint],
+            known_torque=known[:, joint],
         )
         for joint, name in enumerate(arm.compensator.joints)
     ]
 
 
 def log_text(log: ServoLog) -> str:
-    """A log of `joint_logs` as the CSV file that `elastic identify --log` reads."""
+    """Text of the CSV file of a log of `joint_logs`, for `elastic identify --log`."""
     inertia = np.full_like(log.time, log.load.inertia)
     known = log.external_torque(log.position)
     rows = np.column_stack([log.time, log.goal, log.position, inertia, known])
@@ -141,26 +141,27 @@ def log_text(log: ServoLog) -> str:
     return "\n".join([head, *lines, ""])
 
 
-def _info(folder: Path) -> Mapping[str, Any]:
-    """Content of meta/info.json."""
+def _read_info(folder: Path) -> Mapping[str, Any]:
+    """Read meta/info.json."""
     path = folder / "meta" / "info.json"
     content = read_json(
         path,
         _MOST_BYTES,
-        lambda why: (
+        lambda reason: (
             f"{shorten(folder)} is no data set of LeRobot, which has meta/info.json and"
-            f" data/ ({why})"
+            f" data/ ({reason})"
         ),
     )
     features = content.get("features") if isinstance(content, Mapping) else None
     if not isinstance(features, Mapping):
-        problem = f"{shorten(path)} describes no features; record the data set anew"
-        raise ConfigurationError(problem)
+        raise ConfigurationError(
+            f"{shorten(path)} describes no features; record the data set again"
+        )
     return content
 
 
-def _motors(folder: Path, info: Mapping[str, Any], key: str) -> dict[str, int]:
-    """Columns of the positions of motors within `action` or `observation.state`, by their names."""
+def _motor_columns(folder: Path, info: Mapping[str, Any], key: str) -> dict[str, int]:
+    """Columns of the motors within `action` or `observation.state`, by their names."""
     feature = info["features"].get(key)
     names = feature.get("names") if isinstance(feature, Mapping) else None
     if isinstance(names, Mapping):  # {"motors": [...]}
@@ -168,30 +169,30 @@ def _motors(folder: Path, info: Mapping[str, Any], key: str) -> dict[str, int]:
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         raise ConfigurationError(f"{shorten(folder)} does not name the motors of {key}")
     plain = [name.removeprefix(_OLD_PREFIX).removesuffix(".pos") for name in names]
-    return {name: at for at, name in enumerate(plain) if "." not in name}
+    return {name: column for column, name in enumerate(plain) if "." not in name}
 
 
 def _require_clock(file: Path, episode: int, time: Array) -> None:
-    """Refuse a clock along which no motion has a speed and an acceleration."""
+    """Refuse a clock that does not grow, has gaps, or has too few rows for an acceleration."""
     step = np.diff(time)
     usual = np.median(step) if len(step) else 0.0
     if len(time) < _FEWEST_ROWS or step.min() <= 0.0 or step.max() > _LONGEST_GAP * usual:
-        apart = f", {step.min():.3g} to {step.max():.3g} s apart" if len(step) else ""
+        steps = f", {step.min():.3g} to {step.max():.3g} s apart" if len(step) else ""
         raise ConfigurationError(
             f"{shorten(file)}, episode {episode}: needs at least {_FEWEST_ROWS} rows with a"
             f" timestamp that grows, without gaps of {_LONGEST_GAP} usual steps, it has"
-            f" {len(time)}{apart}; name the other episodes by --episodes"
+            f" {len(time)}{steps}; name the other episodes by --episodes"
         )
 
 
-def _episodes(
+def _read_file(
     file: Path,
     motors: Sequence[str],
     goals: Mapping[str, int],
     positions: Mapping[str, int],
-    wanted: Sequence[int],
+    episodes: Sequence[int],
 ) -> Iterator[Recording]:
-    """Episodes of a file of rows."""
+    """Read some or all episodes of a file of rows."""
     table = read_episodes(file, _MOST_BYTES)
     for values, columns in ((table.goal, goals), (table.position, positions)):
         if values.shape[1] <= max(columns.values()):
@@ -200,7 +201,7 @@ def _episodes(
                 f" {max(columns.values()) + 1}"
             )
     for episode in np.unique(table.episode):
-        if wanted and episode not in wanted:
+        if episodes and episode not in episodes:
             continue
         rows = table.episode == episode
         _require_clock(file, episode, table.time[rows])

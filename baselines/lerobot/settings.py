@@ -15,43 +15,44 @@ from elastic_env.core.files import read_rows
 Units = Literal["degrees", "range", "percent"]
 """Degrees, −100 to 100 over the calibrated range, or 0 to 100 over it."""
 GRIPPER = "gripper"
-"""Motor that keeps its goal, unless a place says which joint it moves."""
+"""Motor that keeps its goal, unless `places` gives the joint that it moves."""
 _TWO_ARMS = "bi_"
-"""Begin of the type of a robot with two arms."""
-_COUNTS = 2**31
+"""Prefix of the types of robots with two arms."""
+_LARGEST_COUNT = 2**31
 _MOST_BYTES = 1_000_000
+"""Largest size of a calibration file."""
 
 
 class Motor(Model):
-    """A motor of an arm as LeRobot has it."""
+    """A motor of an arm in LeRobot."""
 
     name: Title
     units: Units
     counts_per_turn: int | None = None
-    """None for a motor that is read in degrees [1]."""
+    """None for a motor that LeRobot reads in degrees [1]."""
     joint: Title | None = None
-    """Joint of the maker's model, with * for the side; default the motor's name."""
+    """Joint of the manufacturer's model, with * for the side; default the motor's name."""
 
 
 class MotorCalibration(Model):
-    """What LeRobot's calibration says of a motor, in counts of its encoder."""
+    """LeRobot's calibration of a motor, in counts of its encoder."""
 
     id: int
     drive_mode: int = quantity("1", ge=0, le=1)
-    """1 where LeRobot turns the sign of values; these have it already [1]."""
-    homing_offset: int = quantity("1", ge=-_COUNTS, le=_COUNTS)
-    """In the motor's own register, so that its counts have it already [1]."""
-    range_min: int = quantity("1", ge=-_COUNTS, le=_COUNTS)
-    """Least count of the range that the user showed [1]."""
-    range_max: int = quantity("1", ge=-_COUNTS, le=_COUNTS)
-    """Largest one [1]."""
+    """1 where LeRobot reverses the sign of values; its values already include this [1]."""
+    homing_offset: int = quantity("1", ge=-_LARGEST_COUNT, le=_LARGEST_COUNT)
+    """Offset in the motor's register; its counts already include it [1]."""
+    range_min: int = quantity("1", ge=-_LARGEST_COUNT, le=_LARGEST_COUNT)
+    """Least count of the calibrated range [1]."""
+    range_max: int = quantity("1", ge=-_LARGEST_COUNT, le=_LARGEST_COUNT)
+    """Largest count of the calibrated range [1]."""
 
     @model_validator(mode="after")
     def _range_has_a_width(self) -> Self:
         if self.range_min >= self.range_max:
             raise ValueError(
                 f"range_min must be below range_max, got {self.range_min} and {self.range_max};"
-                " calibrate the arm anew"
+                " calibrate the arm again"
             )
         return self
 
@@ -60,7 +61,7 @@ class JointPlace(Model):
     """The joint of the model that a motor moves."""
 
     joint: Title | None = None
-    """Its name; default that of the motor."""
+    """Name of the joint; default the motor's name."""
     direction: Literal[1, -1] = 1
     """1 where LeRobot's value grows with the joint's angle, -1 where it falls."""
     zero_rad: float = quantity("rad", 0.0, ge=-2.0 * math.pi, le=2.0 * math.pi)
@@ -75,7 +76,7 @@ class ArmSettings(Model):
     robot: Title = "so101_follower"
     """Type of the robot, as LeRobot names it."""
     side: Literal["left", "right"] | None = None
-    """Which arm, where the robot or the model has two; each needs a step of its own."""
+    """The arm, where the robot or the model has two; each needs a separate step."""
     model: str
     """Model of the arm: a file of MJCF or URDF, or the text of one."""
     joints: str | float | dict[str, Any]
@@ -85,24 +86,24 @@ class ArmSettings(Model):
     calibration: str | dict[str, MotorCalibration] = {}
     """JSON file that LeRobot wrote for this arm, or its content; none for motors in degrees."""
     use_degrees: bool | None = None
-    """As in LeRobot's configuration of the robot; default its own default."""
+    """As in LeRobot's configuration of the robot; default LeRobot's default."""
     places: dict[Title, JointPlace | None] = {}
-    """What motors move, where it is not the joint of their name; None for one that keeps its
+    """Joints of motors that do not move the joint of their name; None for a motor that keeps its
     goal.
     """
     position_gain: float | dict[str, float] | None = None
-    """k_p of servos that give way under a load; default what `joints` says [N·m/rad]."""
+    """k_p of servos that give way under a load; default the value in `joints` [N·m/rad]."""
     limit_rad: float = quantity("rad", 0.2, gt=0)
     """Largest offset between command and desired angle [rad]."""
     ramp_s: float = quantity("s", 1.0, ge=0)
-    """Time in which offsets grow from zero after the start [s]."""
+    """Time in which offsets increase from zero after the start [s]."""
     period_s: float = quantity("s", 1.0 / 30.0, gt=0)
     """Time between two actions [s]."""
     friction: bool | None = None
-    """Whether dry friction is compensated; default where any of it grows with the load."""
+    """True to compensate dry friction; default True if any of it grows with the load."""
 
     @model_validator(mode="after")
-    def _motors_are_its_own(self) -> Self:
+    def _motors_exist(self) -> Self:
         require_known("motor", self.places, [motor.name for motor in self.motors])
         if self.side is None and self.robot.startswith(_TWO_ARMS):
             raise ValueError(f"{self.robot} has two arms; say side: left or right")
@@ -110,25 +111,25 @@ class ArmSettings(Model):
 
     @property
     def prefix(self) -> str:
-        """Before the names of motors in actions and observations of a robot with two arms."""
+        """Prefix of the motors' names in actions and observations of a robot with two arms."""
         return f"{self.side}_" if self.robot.startswith(_TWO_ARMS) else ""
 
     @property
     def motors(self) -> tuple[Motor, ...]:
-        """Motors of the robot, with the units that it uses."""
+        """Motors of the robot, with their units."""
         return motors_of(self.robot, self.use_degrees)
 
     @property
     def content_of_calibration(self) -> dict[str, MotorCalibration]:
-        """The calibration, from its file or as it was given."""
-        given = self.calibration
-        return read_calibration(Path(given)) if isinstance(given, str) else given
+        """Calibration, read from the file if `calibration` is a path."""
+        source = self.calibration
+        return read_calibration(Path(source)) if isinstance(source, str) else source
 
 
 @cache
 def known_motors() -> dict[str, tuple[Motor, ...]]:
     """Motors of the robots of motors.csv, by the robot's type."""
-    found: dict[str, tuple[Motor, ...]] = {}
+    motors: dict[str, tuple[Motor, ...]] = {}
     for row in read_rows(Path(__file__).with_name("motors.csv")):
         counts = row["counts_per_turn"]
         motor = Motor(
@@ -137,19 +138,19 @@ def known_motors() -> dict[str, tuple[Motor, ...]]:
             counts_per_turn=int(counts) if counts else None,
             joint=row["joint"] or None,
         )
-        found[row["robot"]] = (*found.get(row["robot"], ()), motor)
-    return found
+        motors[row["robot"]] = (*motors.get(row["robot"], ()), motor)
+    return motors
 
 
 def motors_of(robot: str, use_degrees: bool | None = None) -> tuple[Motor, ...]:
     """Motors of a robot in LeRobot's order.
 
     Args:
-        robot: Its type, such as so101_follower.
+        robot: Type of the robot, such as so101_follower.
         use_degrees: As in LeRobot's configuration of the robot; None for its default.
 
     Raises:
-        ConfigurationError: The type is not known, or its motors know degrees alone.
+        ConfigurationError: The type is not known, or its motors support degrees only.
     """
     known = known_motors()
     require_known("robot of LeRobot", [robot], known)
@@ -173,10 +174,10 @@ class _Calibration(Model):
 
 
 def read_calibration(path: Path) -> dict[str, MotorCalibration]:
-    """Calibration of an arm, the JSON file that LeRobot writes.
+    """Read the calibration of an arm, a JSON file that LeRobot writes.
 
     Raises:
-        ConfigurationError: It cannot be read, or is no calibration.
+        ConfigurationError: The file cannot be read, or is no calibration.
     """
     content = read_json(
         path,

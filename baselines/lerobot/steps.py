@@ -1,7 +1,7 @@
 """Processor steps of LeRobot, registered by importing this module; it needs the package lerobot.
 
 `elastic_env_compensate_action` belongs at the end of the pipeline before `send_action`, and
-`elastic_env_correct_observation` at the begin of the one after `get_observation`.
+`elastic_env_correct_observation` at the start of the pipeline after `get_observation`.
 """
 
 from typing import Any
@@ -36,7 +36,7 @@ class _ArmStep:
         self.arm = LeRobotArm(ArmSettings(**settings))
 
     def get_config(self) -> dict[str, Any]:
-        """Settings as JSON, with the content of files in the place of their names."""
+        """Settings as JSON, with the content of files instead of their names."""
         return self.arm.settings.model_dump(mode="json")
 
     def transform_features(self, features: Features) -> Features:
@@ -46,10 +46,10 @@ class _ArmStep:
 
 @ProcessorStepRegistry.register("elastic_env_compensate_action")
 class CompensateActionStep(_ArmStep, RobotActionProcessorStep):
-    """Leads the positions of an action by what springs and servos give way.
+    """Adds the deflections of springs and servos to the positions of an action.
 
     Args:
-        **settings: As of `ArmSettings`.
+        **settings: Fields of `ArmSettings`.
 
     Attributes:
         arm: Units and compensator; `arm.compensator.set_payload` takes a payload.
@@ -63,15 +63,15 @@ class CompensateActionStep(_ArmStep, RobotActionProcessorStep):
         return self.arm.command(action)
 
     def reset(self) -> None:
-        """Begin anew: the ramp starts at zero."""
+        """Restart the ramp at zero."""
         self.arm.reset()
 
 
 @ProcessorStepRegistry.register("elastic_env_correct_observation")
 class CorrectObservationStep(_ArmStep, ObservationProcessorStep):
-    """Puts the angles of the links in the place of those that encoders show.
+    """Replaces the angles of the encoders by those of the links.
 
-    Arguments, attributes and errors are as of `CompensateActionStep`.
+    Arguments, attributes and errors are those of `CompensateActionStep`.
     """
 
     def observation(self, observation: RobotObservation) -> RobotObservation:

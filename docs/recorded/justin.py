@@ -18,8 +18,9 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from baselines.identification.geometry_fit import GeometryProblem, fit_geometry
+from baselines.identification.geometry_fit import fit_geometry
 from baselines.identification.geometry_model import Geometry, GeometryModel
+from baselines.identification.geometry_problem import GeometryProblem
 from baselines.identification.geometry_result import correct_model
 from baselines.identification.holdout import RIGID, rival_errors
 from elastic_env.core.config import Model
@@ -194,7 +195,7 @@ def find_rigid(poses: RecordedPoses, mass_factors: Array = _AS_GUESSED) -> mujoc
     few = poses.of(np.arange(min(_POSES_OF_SEARCH, len(poses.theta))))
     spec = justin_spec(find_shoulders(few), mass_factors)
     problem = _problem(spec, poses, tuple(_MARKERS)).as_rigid()
-    return correct_model(spec, _tree(spec, problem.joints), fit_geometry(problem))
+    return correct_model(spec, _tree(spec, problem.model.joints), fit_geometry(problem))
 
 
 def _problem(
@@ -212,10 +213,9 @@ def _problem(
     sites = [(f"{side}_hand", model.site(f"{side}_hand")) for side in sides]
     places = [(name, int(site.bodyid[0]), site.pos.copy()) for name, site in sites]
     problem = GeometryProblem(
-        model=GeometryModel.of(_tree(spec, joints), joints, model.opt.gravity, places),
+        model=GeometryModel.from_tree(_tree(spec, joints), joints, model.opt.gravity, places),
         theta=poses.theta[:, columns],
         measured=poses.measured[:, markers],
-        joints=joints,
         geometry=geometry,
         elastic=joints,
         lateral=lateral,

@@ -22,7 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from baselines.adaptation import offset_folder
-from baselines.identification.identify import StaticPoints
+from baselines.identification.static_points import StaticPoints
 from baselines.policies import is_saved
 from baselines.residual.residual_folder import DESCRIPTION, WEIGHTS, find_folder
 from elastic_env.core.errors import ElasticError, quote

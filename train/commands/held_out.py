@@ -5,7 +5,7 @@ from functools import partial
 from rich import box
 from rich.console import Console
 
-from baselines.identification.holdout import HeldOut, Judged, judge, num_fits, split
+from baselines.identification.holdout import HeldOut, HoldoutProblem, judge, num_fits, split
 from elastic_env.core.errors import ElasticError
 from train.commands.identify_options import HoldoutOptions
 from train.runs.console import make_table
@@ -13,7 +13,7 @@ from train.runs.progress import show_progress
 
 
 def judge_poses(
-    judged: Judged, options: HoldoutOptions, console: Console, seed: int
+    judged: HoldoutProblem, options: HoldoutOptions, console: Console, seed: int
 ) -> HeldOut | None:
     """Held-out errors; None where nothing is held out, which is said.
 
@@ -26,7 +26,7 @@ def judge_poses(
     if not options.holdout:
         return None
     parts = split(len(judged.theta), options.holdout, options.folds, seed)
-    if reason := judged.too_few(parts):
+    if reason := judged.shortage(parts):
         console.print(f"nothing is held out: {reason}")
         return None
     try:

@@ -14,8 +14,8 @@ import elastic_env  # noqa: F401  registers the environments
 from baselines.identification.identify import Identification, identify
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.robots.testbed.model import Pendulum
-from train.commands.identify_arm import IdentifiedArm, identify_arm
-from train.commands.identify_options import ArmOptions, IdentificationRun, OfTestbed
+from train.commands.identify_arm import ArmResult, identify_arm
+from train.commands.identify_options import ArmOptions, IdentificationRun, JointOptions
 from train.commands.options import OnHardware, given_options
 from train.figures import plots
 from train.figures.identification_plots import draw_identification
@@ -28,8 +28,8 @@ class Identify(IdentificationRun):
     """Find the stiffness of the joint from static positions (Fig. 5 of the paper).
 
     Drives the testbed to its positions from both sides, averages encoder and IMU at rest, and
-    separates stiffness, friction, dead band and offset. Writes identification.json, which the
-    environment and the compensators take as their K, and a figure. Example: elastic identify
+    separates stiffness, friction, dead band and offset. Writes identification.json, from which the
+    environment and the compensators read their K, and a figure. Example: elastic identify
     --scenario backlash
 
     On a real joint: elastic identify --port /dev/ttyUSB0 --imu-port /dev/ttyACM0
@@ -42,11 +42,11 @@ class Identify(IdentificationRun):
     run.csv --mass-kg 0.5 --lever-m 0.1
     """
 
-    testbed: OfTestbed = OfTestbed()
+    testbed: JointOptions = JointOptions()
     on: Annotated[OnHardware, tyro.conf.arg(name="hardware")] = OnHardware()
     arm: ArmOptions = ArmOptions()
 
-    def run(self, console: Console) -> list[Identification] | IdentifiedArm | None:
+    def run(self, console: Console) -> list[Identification] | ArmResult | None:
         """Identify the testbed, simulated or real, or an arm; write result and figure.
 
         Returns:
@@ -54,16 +54,18 @@ class Identify(IdentificationRun):
 
         Raises:
             ConfigurationError: A name does not exist, or an option does not go with another.
-            ResultsExistError: The output folder holds results.
+            ResultsExistError: The output folder contains results.
         """
         if self.arm == ArmOptions():
             return self._identify_testbed(console)
-        names = given_options(self.testbed, OfTestbed.model_fields)
+        unused = given_options(self.testbed, JointOptions.model_fields)
         if self.on != OnHardware():
-            names.append("--port and the like")
-        if names:
-            problem = f"options of the testbed: {', '.join(names)}"
-            raise ConfigurationError(f"{problem}; leave them out beside --robot and --log")
+            unused.append("--port and the like")
+        if unused:
+            raise ConfigurationError(
+                f"options of the testbed: {', '.join(unused)}; leave them out beside --robot and"
+                " --log"
+            )
         return identify_arm(self.arm, self, console)
 
     def _identify_testbed(self, console: Console) -> list[Identification]:
@@ -73,10 +75,10 @@ class Identify(IdentificationRun):
         if hardware:
             self._require_real_joint(hardware)
         envs = identified_environments(self)
-        asked = {**self.testbed.model_dump(mode="json"), "scenario": scenario}
-        with self.folder({**asked, "hardware": hardware}) as folder:
+        options = {**self.testbed.model_dump(mode="json"), "scenario": scenario}
+        with self.folder({**options, "hardware": hardware}) as folder:
             try:
-                with _progress(hardware, console) as progress:
+                with _show_share(hardware, console) as progress:
                     results, points = identify(envs, self.seed, progress)
             finally:
                 for env in envs:
@@ -87,12 +89,11 @@ class Identify(IdentificationRun):
             draw_identification(results[0], points[0], models, files[1])
             console.print(result_table(results[0]))
             if self.testbed.repeats > 1:
-                seeds = range(self.seed, self.seed + self.testbed.repeats)
-                found = zip(seeds, results, strict=True)
-                rows = [{"seed": seed, **own.model_dump()} for seed, own in found]
+                numbered = enumerate(results, self.seed)
+                rows = [{"seed": seed, **result.model_dump()} for seed, result in numbered]
                 files.append(write_records(rows, folder / "repeats.csv"))
                 truth = float(envs[0].unwrapped.truth().model.stiffness[0])
-                console.print(_spread(pd.DataFrame(rows), results, truth))
+                console.print(_repeats_summary(pd.DataFrame(rows), results, truth))
         for path in files:
             console.print(f"wrote {path}")
         return results
@@ -100,19 +101,22 @@ class Identify(IdentificationRun):
     def _require_real_joint(self, hardware: Mapping[str, Any]) -> None:
         """Refuse options that do not go with a real joint."""
         if hardware.get("imu_port") is None:
-            needed = "an identification on hardware needs the link's angle"
-            raise ConfigurationError(f"{needed}: name the IMU with --imu-port")
+            raise ConfigurationError(
+                "an identification on hardware needs the link's angle: name the IMU with --imu-port"
+            )
         if self.testbed.stiffness is not None or self.testbed.repeats > 1:
-            problem = "stiffness and repeats are of a simulated joint; leave them out on hardware"
-            raise ConfigurationError(problem)
+            raise ConfigurationError(
+                "stiffness and repeats are of a simulated joint; leave them out on hardware"
+            )
         if self.testbed.second_mass is not None and not hardware.get("confirm", True):
-            problem = "somebody must change the mass between the runs: a second_mass excludes --yes"
-            raise ConfigurationError(problem)
+            raise ConfigurationError(
+                "somebody must change the mass between the runs: a second_mass excludes --yes"
+            )
 
 
 @contextmanager
-def _progress(hardware: Mapping[str, Any], console: Console) -> Iterator[Callable[[float], None]]:
-    """A function that takes the share of the work that is done."""
+def _show_share(hardware: Mapping[str, Any], console: Console) -> Iterator[Callable[[float], None]]:
+    """Display of the finished share of the work, which the function within sets."""
     work = "visiting static positions"
     if hardware:
         console.print(f"{work} at {hardware['port']}")
@@ -140,12 +144,12 @@ def result_table(result: Identification) -> Table:
         "residual spread": f"{1e3 * result.residual_rad:.3f} mrad",
         "points": f"{result.points} at {result.positions} positions",
     }
-    known = [row for row in rows.items() if row[1]]
-    return make_table("identification", ["", ""], known, left=2, show_header=False)
+    filled = [row for row in rows.items() if row[1]]
+    return make_table("identification", ["", ""], filled, left=2, show_header=False)
 
 
 def identified_environments(options: Identify) -> list[Any]:
-    """The testbed, once per mass; nothing is opened yet."""
+    """The testbed, once per mass; no port is opened yet."""
     arguments = dict(options.on.arguments)
     pendulum = Pendulum(**arguments.pop("pendulum", {}))
     pendulums = [pendulum]
@@ -163,11 +167,11 @@ def identified_environments(options: Identify) -> list[Any]:
         }
     arguments["reference"] = {"kind": "hold", "positions": options.testbed.positions}
     arguments["vectorization_mode"] = "vector_entry_point"
-    return [gymnasium.make_vec(name, pendulum=own, **arguments) for own in pendulums]
+    return [gymnasium.make_vec(name, pendulum=pendulum, **arguments) for pendulum in pendulums]
 
 
-def _spread(table: pd.DataFrame, results: Sequence[Identification], truth: float) -> str:
-    """Spread over the seeds, and how often the intervals hold the truth."""
+def _repeats_summary(table: pd.DataFrame, results: Sequence[Identification], truth: float) -> str:
+    """Spread over the seeds, and the number of intervals that contain the truth."""
     stiffness = table["stiffness_nm_per_rad"]
     low = table["stiffness_low_nm_per_rad"]
     high = table["stiffness_high_nm_per_rad"]

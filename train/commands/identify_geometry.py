@@ -7,14 +7,15 @@ import numpy as np
 from rich import box
 from rich.console import Console
 
-from baselines.identification.geometry_fit import GeometryProblem, fit_geometry
+from baselines.identification.geometry_fit import fit_geometry
 from baselines.identification.geometry_model import AxialTorques, GeometryModel
+from baselines.identification.geometry_problem import GeometryProblem
 from baselines.identification.geometry_result import (
     GeometryIdentification,
     correct_model,
     describe_geometry,
 )
-from baselines.identification.holdout import Judged
+from baselines.identification.holdout import HoldoutProblem
 from baselines.identification.pose_log import PoseLog
 from elastic_env.core.errors import list_names, unknown_name
 from elastic_env.joint.model_file import read_model
@@ -39,12 +40,12 @@ def identify_geometry(
     """Identify geometry and stiffness, write files and figure, print tables.
 
     Args:
-        options: The arm, and what is sought.
+        options: The arm, and its unknowns.
         log: Poses with places of markers.
-        elastic: Joints whose stiffness is sought.
+        elastic: Joints whose stiffness is estimated.
         end_effector: Site or body that is measured, where the log names no markers.
-        run: Seed of the poses that are held out, and where results go.
-        console: Where progress and tables go.
+        run: Seed of the poses that are held out, and folder of the results.
+        console: Console for progress and tables.
 
     Raises:
         ConfigurationError: A name does not exist, or there are too few poses.
@@ -56,8 +57,10 @@ def identify_geometry(
         with show_progress(console, {"fits": 1}, transient=True) as show:
             fit = fit_geometry(problem)
             show(0, 1)
-        judged = judge_poses(Judged.of_geometry(problem), options.judged, console, run.seed)
-        result = describe_geometry(fit, judged)
+        held_out = judge_poses(
+            HoldoutProblem.from_geometry(problem), options.judged, console, run.seed
+        )
+        result = describe_geometry(fit, held_out)
         files = result.save(folder, correct_model(spec, tree, fit))
         files.append(draw_geometry(result, folder / f"identification.{run.figure_format}"))
     show_result(result, console)
@@ -82,48 +85,48 @@ def pose_problem(
     if log.kind == "markers":
         names = [column.removesuffix(".x") for column in log.columns[::3]]
     markers = [(name, *site_or_body(model, name)[:2]) for name in names]
-    measured = log.measured.reshape(len(log), len(names), 3)
     problem = GeometryProblem(
-        model=GeometryModel.of(tree, log.joints, model.opt.gravity, markers),
+        model=GeometryModel.from_tree(tree, log.joints, model.opt.gravity, markers),
         theta=log.theta,
-        measured=measured,
-        joints=log.joints,
+        measured=log.measured.reshape(len(log), len(names), 3),
         geometry=options.geometry or "offsets",
         elastic=tuple(elastic),
         lateral=options.lateral,
         priors=options.priors,
         free=options.free,
-        axial=_axial(log),
+        axial=_axial_torques(log),
     )
     return problem.align(), tree
 
 
-def _axial(log: PoseLog) -> AxialTorques | None:
+def _axial_torques(log: PoseLog) -> AxialTorques | None:
     """Sides of approach and known torques of a log; None where it has neither."""
-    if log.direction is None and log.known is None:
+    if log.direction is None and log.known_torque is None:
         return None
     nothing = np.zeros_like(log.theta)
     return AxialTorques(
         direction=nothing if log.direction is None else log.direction,
-        known=nothing if log.known is None else log.known,
+        known_torque=nothing if log.known_torque is None else log.known_torque,
     )
 
 
 def show_result(result: GeometryIdentification, console: Console) -> None:
-    """Print held-out errors, stiffness, and what the poses do not tell."""
+    """Print held-out errors, stiffness, and parameters that the poses do not determine."""
     if result.held_out is not None:
         show_held_out(result.held_out, console)
     rows = []
-    friction = {one.name: one for one in result.parameters if one.kind == "friction"}
+    friction = {
+        parameter.name: parameter.value if parameter.is_told else None
+        for parameter in result.parameters
+        if parameter.kind == "friction"
+    }
     for joint in result.joints:
         stiffness = number_or_dash(joint.stiffness_nm_per_rad).replace("inf", "rigid")
         ends = (joint.stiffness_low_nm_per_rad, joint.stiffness_high_nm_per_rad)
         rows.append([joint.joint, stiffness, *map(number_or_dash, ends)])
         if friction:
-            own = friction.get(joint.joint)
-            rows[-1].append(number_or_dash(own.value if own is not None and own.is_told else None))
-    noise = f"{result.noise_mm:.2f} mm"
-    console.print(f"unexplained: {noise} in each coordinate of a marker")
+            rows[-1].append(number_or_dash(friction.get(joint.joint)))
+    console.print(f"unexplained: {result.noise_mm:.2f} mm in each coordinate of a marker")
     title = f"K [N·m/rad] from {result.poses} poses"
     head = ["joint", "K", "from", "to", *["F [N·m]"] * bool(friction)]
     console.print(make_table(title, head, rows, box=box.SIMPLE))
@@ -132,9 +135,9 @@ def show_result(result: GeometryIdentification, console: Console) -> None:
             f"{result.numbers} measured numbers for {len(result.parameters)} parameters: most rests"
             " on the priors; log more poses"
         )
-    unseen = result.prior_parameters
-    if unseen:
+    undetermined = result.prior_parameters
+    if undetermined:
         console.print(
-            f"{len(unseen)} of {len(result.parameters)} parameters keep their prior, as the"
-            f" poses do not tell them: {list_names(unseen)}"
+            f"{len(undetermined)} of {len(result.parameters)} parameters keep their prior, as the"
+            f" poses do not tell them: {list_names(undetermined)}"
         )

@@ -11,7 +11,7 @@ from rich.console import Console
 from baselines.identification.servo_fit import STAGES, fit_servo
 from baselines.identification.servo_holdout import ServoHoldout, judge_servo, split_logs
 from baselines.identification.servo_load import Load
-from baselines.identification.servo_log import ServoLog, read_servo_log
+from baselines.identification.servo_log import read_servo_log
 from baselines.identification.servo_result import ServoIdentification, describe_servo
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.files import digest_of
@@ -37,8 +37,8 @@ def identify_servo(
 
     Args:
         options: Logs of one servo, and its load: robot and joint, or a pendulum.
-        run: Seed of the draw of logs that are not fitted, and where results go.
-        console: Where progress and tables go.
+        run: Seed of the draw of logs that are not fitted, and folder of the results.
+        console: Console for progress and tables.
 
     Raises:
         ConfigurationError: A log or an option cannot be used, or is for poses only.
@@ -51,30 +51,30 @@ def identify_servo(
     load = known_load(servo, options.robot, joint)
     paths = fitted_logs(options.log, servo.unfitted, console)
 
-    def read(path: str) -> ServoLog:
-        return read_servo_log(Path(path), load, servo.gain, servo.angles, joint)
-
-    logs = list(map(read, paths))
-    further = list(map(read, servo.unfitted))
-    _require_alike("supply voltage", [log.supply == 1.0 for log in (*logs, *further)])
-    _require_alike("gain", [log.gain is None for log in (*logs, *further) if log.enabled.any()])
+    logs, unfitted = (
+        [read_servo_log(Path(path), load, servo.gain, servo.angles, joint) for path in group]
+        for group in (paths, servo.unfitted)
+    )
+    _require_all_or_none("supply voltage", [log.supply == 1.0 for log in (*logs, *unfitted)])
+    powered = [log for log in (*logs, *unfitted) if log.enabled.any()]
+    _require_all_or_none("gain", [log.gain is None for log in powered])
     inner = logs
-    outer = further
-    if not further and options.judged.holdout:
+    outer = unfitted
+    if not unfitted and options.judged.holdout:
         inner, outer = split_logs(logs, options.judged.holdout, run.seed)
     with run.folder(options.model_dump(mode="json")) as folder:
         fits = 1 if inner is logs else 2
         with show_progress(console, {"fits, stages": fits * STAGES}, transient=True) as show:
             fit = fit_servo(inner, partial(show, 0), run.seed)
             held_out = judge_servo(fit, outer) if outer else None
-            shown = outer or logs
-            played = [fit.replay(log) for log in shown]
+            drawn = outer or logs
+            replays = [fit.replay(log) for log in drawn]
             if inner is not logs:
                 fit = fit_servo(logs, lambda done: show(0, STAGES + done), run.seed)
         result = describe_servo(fit, joint or "*", held_out)
         files = result.save(folder)
         picture = folder / f"identification.{run.figure_format}"
-        files.append(draw_servo(shown, played, picture, is_held_out=bool(outer)))
+        files.append(draw_servo(drawn, replays, picture, is_held_out=bool(outer)))
     show_result(result, console)
     for path in files:
         console.print(f"wrote {path}")
@@ -83,9 +83,8 @@ def identify_servo(
 
 def _require_no_poses(options: ArmOptions) -> None:
     """Refuse options that are for poses only, and several joints."""
-    known = ("log", "robot", "joints", "servo", "markers", "judged")
-    others = [name for name in ArmOptions.model_fields if name not in known]
-    unused = given_options(options, others)
+    used = ("log", "robot", "joints", "servo", "markers", "judged")
+    unused = given_options(options, [name for name in ArmOptions.model_fields if name not in used])
     if options.markers != GeometryOptions():
         unused.append("those of --geometry")
     unused += given_options(options.judged, ["folds"])
@@ -101,27 +100,26 @@ def _require_no_poses(options: ArmOptions) -> None:
 
 
 def known_load(options: ServoOptions, robot: str | None, joint: str | None) -> Load | None:
-    """What hangs on the joint; None if the logs say it.
+    """Load of the joint by the options; None if the logs contain it.
 
     Raises:
-        ConfigurationError: Half a pendulum, a pendulum beside a robot, or a robot without a joint.
+        ConfigurationError: Half a pendulum, a pendulum besides a robot, or a robot without a joint.
     """
-    given = [options.mass_kg is not None, options.lever_m is not None]
-    if any(given) and not all(given):
+    if (options.mass_kg is None) != (options.lever_m is None):
         raise ConfigurationError("a pendulum needs both --mass-kg and --lever-m")
     if robot is None:
         if options.mass_kg is None or options.lever_m is None:
             return None
         return Load.pendulum(options.mass_kg, options.lever_m)
-    if any(given):
+    if options.mass_kg is not None:
         raise ConfigurationError("give a pendulum by --mass-kg and --lever-m, or --robot, not both")
     if joint is None:
         raise ConfigurationError("say by --joints which joint of the robot the log is of")
-    return Load.of_joint(compiled_model(robot), joint)
+    return Load.from_model(compiled_model(robot), joint)
 
 
 def show_result(result: ServoIdentification, console: Console) -> None:
-    """Print held-out errors, parameters, and what the logs do not tell."""
+    """Print held-out errors, parameters, and what the logs do not determine."""
     if result.held_out is not None:
         console.print(verdict(result.held_out))
         rows = [
@@ -138,18 +136,19 @@ def show_result(result: ServoIdentification, console: Console) -> None:
         )
         console.print(make_table(title, head, rows, box=box.SIMPLE))
     rows = []
-    for one in result.gains:
-        register = "" if one.register_value is None else f" at gain {one.register_value:g}"
-        supply = "" if one.supply_v is None else f", {one.supply_v:.4g} V"
-        gain = f"{one.position_gain_nm_per_rad:.4g}"
-        rows.append([f"k_p{register}{supply}", gain, _width(one.half_width), "N·m/rad", ""])
-    for one in result.parameters:
-        if one.name != "position_gain" and one.value is not None:
-            width = _width(one.half_width)
-            name = one.name
+    for gain in result.gains:
+        register = "" if gain.register_value is None else f" at gain {gain.register_value:g}"
+        supply = "" if gain.supply_v is None else f", {gain.supply_v:.4g} V"
+        value = f"{gain.position_gain_nm_per_rad:.4g}"
+        rows.append([f"k_p{register}{supply}", value, _width(gain.half_width), "N·m/rad", ""])
+    for parameter in result.parameters:
+        if parameter.name != "position_gain" and parameter.value is not None:
+            name = parameter.name
             if name == "torque_limit" and result.supply_v is not None:
                 name += f" at {result.supply_v:.4g} V"
-            rows.append([name, f"{one.value:.4g}", width, one.unit, one.remark])
+            width = _width(parameter.half_width)
+            value = f"{parameter.value:.4g}"
+            rows.append([name, value, width, parameter.unit, parameter.remark])
     title = f"servo from {len(result.logs)} logs, replayed within {result.rms_mrad:.1f} mrad rms"
     head = ["parameter", "value", "95 %", "unit", "follows from"]
     console.print(make_table(title, head, rows, box=box.SIMPLE))
@@ -161,38 +160,39 @@ def show_result(result: ServoIdentification, console: Console) -> None:
 def verdict(held_out: ServoHoldout) -> str:
     """Held-out errors in a sentence; a rival that is ahead comes first.
 
-    A replay that goes wrong once the torque is off is named too.
+    A replay that is far worse with the torque off is named too.
     """
-    own = held_out.errors[-1]
+    identified = held_out.errors[-1]
     rival = held_out.best_rival
     swing = ""
-    if held_out.has_torque_off and held_out.replay_mrad > _MUCH_WORSE * rival.rms_mrad:
+    if held_out.has_torque_off and held_out.replay_mrad > _FAR_WORSE_RATIO * rival.rms_mrad:
         swing = f"; with the torque off included the replay has {held_out.replay_mrad:.1f}"
-    if own.rms_mrad < rival.rms_mrad:
+    if identified.rms_mrad < rival.rms_mrad:
         return (
-            f"not fitted: the replay is {own.rms_mrad:.1f} mrad off, {rival.name}"
+            f"not fitted: the replay is {identified.rms_mrad:.1f} mrad off, {rival.name}"
             f" {rival.rms_mrad:.1f}, the goal itself {held_out.errors[0].rms_mrad:.1f}{swing}"
         )
     return (
         f"{rival.name} is ahead: {rival.rms_mrad:.1f} mrad at logs that were not fitted, where the"
-        f" replay has {own.rms_mrad:.1f}{swing}: use that, or log more motions"
+        f" replay has {identified.rms_mrad:.1f}{swing}: use that, or log more motions"
     )
 
 
-_MUCH_WORSE = 1.5
+_FAR_WORSE_RATIO = 1.5
+"""Error of the replay with the torque off over the best rival's, from which it is named."""
 
 
 def fitted_logs(paths: Sequence[str], unfitted: Sequence[str], console: Console) -> list[str]:
-    """Logs of `--log` that are fitted: those that `--unfitted` names too are left out, and named.
+    """Logs of `--log` that are fitted: those that `--unfitted` names too are left out, and printed.
 
-    Logs are the same by their path or by their content.
+    Two logs are the same if their paths or their contents are equal.
 
     Raises:
-        ConfigurationError: An option names one twice, or nothing is left to fit.
+        ConfigurationError: An option names a log twice, or no log is left to fit.
     """
-    logs, further = (_each_once(given) for given in (paths, unfitted))
-    named = set().union(*further.values())
-    left_out = [path for path, keys in logs.items() if keys & named]
+    logs, others = (_log_keys(group) for group in (paths, unfitted))
+    excluded = set().union(*others.values())
+    left_out = [path for path, keys in logs.items() if keys & excluded]
     if len(left_out) == len(logs):
         raise ConfigurationError(
             f"--unfitted names all logs of --log, {', '.join(left_out)}: leave one to fit"
@@ -202,31 +202,31 @@ def fitted_logs(paths: Sequence[str], unfitted: Sequence[str], console: Console)
     return [path for path in paths if path not in left_out]
 
 
-def _each_once(paths: Sequence[str]) -> dict[str, set[Path | str]]:
-    """Path and digest of each log.
+def _log_keys(paths: Sequence[str]) -> dict[str, set[Path | str]]:
+    """Absolute path and digest of each log.
 
     Raises:
-        ConfigurationError: One is named twice.
+        ConfigurationError: A log is named twice.
     """
-    seen: dict[str, set[Path | str]] = {}
+    keys_of: dict[str, set[Path | str]] = {}
     for path in paths:
         file = Path(path)
         keys: set[Path | str] = {file.resolve()}
-        with suppress(OSError):  # the reader says why it cannot be read
+        with suppress(OSError):  # the reader reports why it cannot be read
             if file.is_file():
                 keys.add(digest_of(file))
-        for other, own in seen.items():
-            if keys & own:
+        for other, other_keys in keys_of.items():
+            if keys & other_keys:
                 raise ConfigurationError(f"{other} and {path} are the same log; name each once")
-        seen[path] = keys
-    return seen
+        keys_of[path] = keys
+    return keys_of
 
 
-def _require_alike(what: str, lacks: Sequence[bool]) -> None:
-    """Refuse logs of which only some say a value."""
-    if len(set(lacks)) > 1:
+def _require_all_or_none(quantity: str, is_missing: Sequence[bool]) -> None:
+    """Refuse logs of which only some contain a quantity."""
+    if len(set(is_missing)) > 1:
         raise ConfigurationError(
-            f"some logs say their {what} and some do not; give it in all or in none"
+            f"some logs say their {quantity} and some do not; give it in all or in none"
         )
 
 

@@ -37,12 +37,12 @@ _MOST_ROBOTS = 64
 class Iterate(Model):
     """Learn on the robot itself, from walk to walk: iterative learning control.
 
-    Nothing is trained in simulation.
+    No training in simulation is needed.
 
-    After each trial the offsets of the next one are corrected by what IMU and foot sensors, or on
-    the testbed the IMU of the link, have shown at the same time. Prints a table trial by trial;
-    trial 0 is the base, the last one has all that was learned. Writes the learned offsets as a
-    policy iterative:FOLDER, trials.csv and a picture.
+    After each trial the measurements of IMU and foot sensors correct the offsets of the next trial
+    at the same time of the motion. On the testbed these are the measurements of the link's IMU.
+    Prints a table of the trials; trial 0 is the base, the last one has all learned offsets. Writes
+    the learned offsets as a policy iterative:FOLDER, trials.csv and a picture.
 
     Example: elastic iterate --scenario soft --trials 10
 
@@ -57,17 +57,17 @@ class Iterate(Model):
     reference: MotionOrDefault = None
     """Motion, as in elastic evaluate; it must be the same in every trial."""
     trials: int = quantity("1", 10, ge=1, le=1000)
-    """Trials that it learns from."""
+    """Number of trials to learn from."""
     base: Title | None = None
-    """Policy whose offsets are learned; default adaptive_posture, on the testbed input."""
+    """Policy to which offsets are learned; default adaptive_posture, on the testbed input."""
     seed: Seed = 0
     """Seed of the robot, where the scenario draws one."""
     robots: int = quantity("1", 1, ge=1, le=_MOST_ROBOTS)
-    """Robots, each of which learns by itself; their seeds follow --seed."""
+    """Number of robots, each of which learns alone; their seeds follow --seed."""
     output: Path | None = None
     """Folder for the run, new or empty; default runs/iterate, numbered if taken."""
     figure_format: plots.FigureFormat = "png"
-    """Of the figures: pdf and svg have no resolution, and png has 300 dpi."""
+    """Format of the figures: pdf and svg have no resolution, and png has 300 dpi."""
 
     @model_validator(mode="after")
     def _motion_repeats(self) -> "Iterate":
@@ -82,26 +82,26 @@ class Iterate(Model):
 
     @property
     def gains(self) -> LearningGains:
-        """How it learns."""
+        """Gains of the learning."""
         return LearningGains(trials=self.trials)
 
     @property
     def condition(self) -> Condition:
-        """The cell in which it learns."""
+        """Robot, scenario and motion of the trials."""
         options: dict[str, Any] = {"learning": self.gains}
         if self.base is not None:
             options["learned_base"] = self.base
         return cell_of(self, PolicySpec(name="iterative", options=options))
 
     def run(self, console: Console) -> list[Trial]:
-        """Learn, play a last trial with what was learned, write the run, and print the trials.
+        """Learn, play a last trial with the learned offsets, write the run, and print the trials.
 
         Returns:
-            The trials; the first has no offsets, the last has what was learned.
+            The trials; the first has no offsets, the last has all learned ones.
 
         Raises:
             ConfigurationError: A name or a parameter does not exist.
-            ResultsExistError: The output folder holds results.
+            ResultsExistError: The output folder contains results.
         """
         plots.require_matplotlib()
         condition = self.condition
@@ -110,14 +110,13 @@ class Iterate(Model):
             policy: IterativeLearner = make_policy(condition.policy, env)
             with run_folder("iterate", recorded, self.seed, self.output) as folder:
                 trials = self._play(env, policy, console)
-                columns = condition.environment.judged
                 title = f"Learned on the robot, {self.scenario}"
-                chart = trials_chart(trials, columns, title)
+                chart = trials_chart(trials, condition.environment.judged, title)
                 files = [
-                    self._write(trials, policy.names, folder / "trials.csv"),
+                    self._write_trials(trials, policy.names, folder / "trials.csv"),
                     plots.draw_chart(chart, folder / f"trials.{self.figure_format}"),
                 ]
-                policies = self._save(env, policy, folder)
+                policies = self._save_offsets(env, policy, folder)
         console.print(trials_table(trials, condition))
         for path in files:
             console.print(f"wrote {path}")
@@ -126,21 +125,22 @@ class Iterate(Model):
         return trials
 
     def _play(self, env: Any, policy: IterativeLearner, console: Console) -> list[Trial]:
+        """Play all trials, the last one with all learned offsets."""
         trials: list[Trial] = []
         totals = {"trials": policy.trials + 1}
         with show_progress(console, totals, transient=True) as show:
 
-            def keep(trial: Trial) -> None:
+            def add(trial: Trial) -> None:
                 trials.append(trial)
                 show(0, len(trials))
 
-            policy.rehearse(env, self.seed, keep)
+            policy.rehearse(env, self.seed, add)
             signals = learned_signals(env.unwrapped.assumed_model, self.gains)
-            keep(Trials(env, self.seed).play(policy, signals, policy.trials))
+            add(Trials(env, self.seed).play(policy, signals, policy.trials))
         return trials
 
-    def _write(self, trials: Sequence[Trial], names: Sequence[str], path: Path) -> Path:
-        """One row per robot and trial: what the sensors showed, and the metrics."""
+    def _write_trials(self, trials: Sequence[Trial], names: Sequence[str], path: Path) -> Path:
+        """Write a row per robot and trial: measured errors and metrics."""
         columns = [f"measured_{name}" for name in names]
         rows = []
         for trial in trials:
@@ -151,11 +151,11 @@ class Iterate(Model):
                 rows.append({**row, **dict(measured), **metrics})
         return write_records(rows, path)
 
-    def _save(self, env: Any, policy: IterativeLearner, folder: Path) -> list[Path]:
-        """Write the offsets of every robot: into the folder for one, else into folders by seed."""
+    def _save_offsets(self, env: Any, policy: IterativeLearner, folder: Path) -> list[Path]:
+        """Write the offsets of a single robot into the folder, of several into folders by seed."""
         model = env.unwrapped.assumed_model
-        chosen = PolicyOptions(learned_base=self.base)
-        base = learned_base(chosen, isinstance(model, WalkerModel))
+        options = PolicyOptions(learned_base=self.base)
+        base = learned_base(options, isinstance(model, WalkerModel))
         folders = []
         for robot, table in enumerate(policy.tables):
             seed = self.seed + robot
@@ -169,22 +169,22 @@ class Iterate(Model):
                 scenario=self.scenario,
                 training=provenance(seed),
             )
-            is_one = len(policy.tables) == 1
-            folders.append(folder if is_one else folder / f"robot_{seed}")
+            folders.append(folder if len(policy.tables) == 1 else folder / f"robot_{seed}")
             save_table(folders[-1], description, table)
         return folders
 
 
 def trials_table(trials: Sequence[Trial], condition: Condition) -> Table:
-    """Judged metrics of every trial, means over the robots that did not fail, and failures."""
-    known = condition.environment
-    title = f"{known.title(condition.reference_name)}, {condition.scenario}"
-    head = ["trial", *(column.label for column in known.judged), known.failures]
+    """Metrics of every trial, means over the robots that did not fail, and failures."""
+    environment = condition.environment
+    title = f"{environment.title(condition.reference_name)}, {condition.scenario}"
+    head = ["trial", *(column.label for column in environment.judged), environment.failures]
     rows = []
     for trial in trials:
         robots = pd.DataFrame(trial.metrics).loc[~trial.failed]
         scores = [
-            number_interval(over_cells([np.array([robots[c.metric]])]), c) for c in known.judged
+            number_interval(over_cells([np.array([robots[c.metric]])]), c)
+            for c in environment.judged
         ]
         failed = f"{int(trial.failed.sum())} of {len(trial.failed)}"
         rows.append([str(trial.number), *scores, failed])

@@ -14,9 +14,9 @@ from train.runs.folders import run_folder
 
 
 class Lerobot(Model):
-    """Make logs of joints out of a data set of LeRobot, for elastic identify --log.
+    """Convert a data set of LeRobot to logs of joints, for elastic identify --log.
 
-    Goals and positions become angles of the model, by the arm's calibration. The model says the
+    The arm's calibration converts goals and positions to angles of the model. The model gives the
     torque of weight and motion on each joint. Writes JOINT_EPISODE.csv for each joint and episode.
 
     Example: elastic lerobot recordings/sweep --model so101.urdf --calibration my_arm.json
@@ -31,13 +31,13 @@ class Lerobot(Model):
     calibration: Locator | None = None
     """JSON file that LeRobot wrote for the arm; none for motors in degrees, such as OpenArm's."""
     robot: Title | None = None
-    """Type of the robot, as LeRobot names it; default what the data set says."""
+    """Type of the robot, as LeRobot names it; default the type in the data set."""
     side: Literal["left", "right"] | None = None
-    """Which arm, where the robot or the model has two."""
+    """The arm, where the robot or the model has two."""
     use_degrees: bool | None = None
-    """As in LeRobot's configuration of the robot; default its own default."""
+    """As in LeRobot's configuration of the robot; default LeRobot's default."""
     places: Path | None = None
-    """YAML file that says which joint a motor moves, its direction and zero_rad, see
+    """YAML file with the joint that each motor moves, its direction and zero_rad, see
     docs/lerobot.md; default the joints of the motors' names.
     """
     episodes: list[int] = []
@@ -46,7 +46,7 @@ class Lerobot(Model):
     """Folder for the logs, new or empty; default runs/lerobot, numbered if taken."""
 
     def run(self, console: Console) -> None:
-        """Convert."""
+        """Convert the data set and write the logs."""
         settings = ArmSettings(
             robot=self.robot or robot_of(self.dataset),
             side=self.side,

@@ -7,7 +7,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from baselines.identification.identify import HoldRecorder, StaticPoints
+from baselines.identification.static_points import HoldRecorder, StaticPoints
 from elastic_env.core.signals import Array, BoolArray
 from elastic_env.world.robot_model import WalkerModel
 from train.evaluate.conditions import Condition

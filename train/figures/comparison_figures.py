@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from baselines.compensation.gravity_torque import make_gravity
-from baselines.identification.identify import link_torque
+from baselines.identification.static_points import link_torque
 from elastic_env.core.signals import Array
 from elastic_env.world.robot_model import RobotModel
 from train.evaluate.conditions import Condition

@@ -11,9 +11,10 @@ from baselines.identification.arm_fit import ArmFit
 from baselines.identification.arm_result import ArmIdentification
 from baselines.identification.geometry_result import GeometryIdentification
 from baselines.identification.holdout import HeldOut
-from baselines.identification.identify import Identification, StaticPoints, link_torque
-from baselines.identification.pose_model import measurement_unit
+from baselines.identification.identify import Identification
+from baselines.identification.pose_log import MEASUREMENT_UNITS
 from baselines.identification.servo_log import ServoLog
+from baselines.identification.static_points import StaticPoints, link_torque
 from elastic_env.core.signals import Array
 from elastic_env.world.robot_model import RobotModel
 from train.figures.plots import MRAD, label_text, new_figure, save, show_numbers
@@ -147,7 +148,7 @@ def _draw_joint(axis: Any, predicted: Array, measured: Array) -> None:
 
 
 def _draw_residuals(axis: Any, fit: ArmFit) -> None:
-    unit = measurement_unit(fit.model.log.kind)
+    unit = MEASUREMENT_UNITS[fit.model.log.kind]
     factor, shown = (1.0, unit) if unit == "N·m" else (1e3, f"m{unit}")
     poses = np.arange(1, len(fit.residual) + 1)
     for column, name in zip(fit.residual.T, _names(fit), strict=True):

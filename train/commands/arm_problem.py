@@ -1,0 +1,90 @@
+"""An arm, its log and its unknowns, as the options of `elastic identify --robot` name them."""
+
+import fnmatch
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import mujoco
+from rich.console import Console
+
+from baselines.identification.pose_checks import require_poses
+from baselines.identification.pose_log import PoseLog, read_log
+from baselines.identification.pose_model import PoseModel
+from baselines.identification.pose_plan import empty_log
+from baselines.identification.pose_unknowns import PoseUnknowns
+from baselines.identification.static_arm import StaticArm
+from elastic_env.core.errors import unknown_name
+from elastic_env.joint.commanded_joints import commanded_hinges
+from elastic_env.joint.model_joints import hinges_of
+from elastic_env.world.robot_model import joint_ranges
+from train.commands.identify_options import ArmOptions
+
+
+@dataclass(frozen=True)
+class ArmProblem:
+    """An arm, its log and its unknowns.
+
+    Attributes:
+        options: Options of the command.
+        arm: The rigid arm.
+        log: Its log; without poses where a first plan is made.
+        elastic: Joints whose stiffness is estimated.
+        seed: Seed of candidate poses and of poses that are held out.
+    """
+
+    options: ArmOptions
+    arm: StaticArm
+    log: PoseLog
+    elastic: tuple[str, ...]
+    seed: int
+
+    @classmethod
+    def from_options(
+        cls, options: ArmOptions, model: mujoco.MjModel, console: Console, seed: int
+    ) -> "ArmProblem":
+        """Read the log, and find everything that the options name.
+
+        Raises:
+            ConfigurationError: The log cannot be used, or a name does not exist.
+        """
+        hinges = hinges_of(model)
+        log = None
+        if options.log:
+            ranges = dict(zip(hinges, zip(*joint_ranges(model, hinges), strict=True), strict=True))
+            log = read_log(Path(options.log[0]), ranges, options.measured_by)
+        joints = commanded_hinges(model) if log is None else log.joints
+        arm = StaticArm(model, joints, options.end_effector, options.payload)
+        if log is None:
+            log = empty_log(arm, options.measured_by or "end_effector")
+        if options.end_effector is None and log.kind in ("end_effector", "imu"):
+            console.print(
+                f"measured is taken to be {arm.end_effector!r}; --end-effector names another site"
+                " or body"
+            )
+        problem = cls(options, arm, log, _elastic_joints(options.joints, log.joints), seed)
+        if options.log and not problem.has_unknown_geometry:
+            require_poses(problem.model(log))
+        return problem
+
+    @property
+    def has_unknown_geometry(self) -> bool:
+        """True if geometry and stiffness are fitted together, to markers."""
+        return self.log.kind == "markers" or self.options.markers.geometry is not None
+
+    def model(self, log: PoseLog) -> PoseModel:
+        """The poses of a log as a function of the unknowns."""
+        has_payload = self.options.payload is not None
+        unknowns = PoseUnknowns.from_log(log, self.elastic, self.options.frame, has_payload)
+        return PoseModel(self.arm, log, unknowns)
+
+
+def _elastic_joints(patterns: Sequence[str], joints: Sequence[str]) -> tuple[str, ...]:
+    """Joints that match a name or pattern, in the order of the log; all without patterns."""
+    chosen = set[str]()
+    for pattern in patterns:
+        matches = fnmatch.filter(joints, pattern)
+        if not matches:
+            raise unknown_name("joint or pattern of the log's joints", pattern, joints)
+        chosen.update(matches)
+    return tuple(joint for joint in joints if joint in chosen or not patterns)
