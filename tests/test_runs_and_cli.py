@@ -44,7 +44,7 @@ from train.evaluate.conditions import Condition, PolicySpec
 from train.evaluate.episodes import Evaluation, evaluate
 from train.evaluate.rollout import PolicyFailedError
 from train.runs.console import shown_warnings, warn_once
-from train.runs.folders import free_folder, run_folder
+from train.runs.folders import create_folder, run_folder
 from train.runs.progress import show_progress
 from train.speed.contenders import RawWorlds, ScalarLoop, VectorLoop
 
@@ -273,8 +273,8 @@ def test_metadata_says_seed_versions_and_commit() -> None:
 def test_named_output_folder_may_be_new_or_empty(tmp_path: Path) -> None:
     """Catches a folder that must exist, and one that must not."""
     (tmp_path / "empty").mkdir()
-    assert free_folder("x", tmp_path / "empty") == tmp_path / "empty"
-    assert free_folder("x", tmp_path / "deep" / "new") == tmp_path / "deep" / "new"
+    assert create_folder("x", tmp_path / "empty") == tmp_path / "empty"
+    assert create_folder("x", tmp_path / "deep" / "new") == tmp_path / "deep" / "new"
 
 
 @pytest.mark.parametrize("kind", ["folder", "file"])
@@ -285,7 +285,7 @@ def test_output_that_exists_is_refused(kind: str, tmp_path: Path) -> None:
     inside.parent.mkdir(exist_ok=True)
     inside.write_text("years of work")
     with pytest.raises(ResultsExistError, match="taken"):
-        free_folder("x", output)
+        create_folder("x", output)
     assert files_of(tmp_path) == {str(inside.relative_to(tmp_path)): b"years of work"}
 
 

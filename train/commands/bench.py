@@ -38,9 +38,9 @@ from train.evaluate.episodes import Evaluation, group_by
 from train.evaluate.statistics import Estimate
 from train.evaluate.table import over_cells
 from train.report.table_formats import Head, Row, Table, print_table, to_markdown
-from train.runs.annotations import annotation, in_workflow
+from train.runs.annotations import annotation, runs_in_workflow
 from train.runs.folders import run_folder
-from train.runs.user_code import CodeNamingModel, is_a, load_without_code
+from train.runs.user_code import CodeNamingModel, kind_check, load_without_code
 
 USUAL = Path("configs/bench.yaml")
 """The default configuration; in a checkout it is that of the package."""
@@ -91,7 +91,7 @@ class BenchConfig(CodeNamingModel):
     margin: float = quantity("1", 0.05, ge=0, le=100)
     """Relative amount by which a figure may exceed the accepted, where it has no margin of its own.
     """
-    _kind = model_validator(mode="before")(is_a("bench"))
+    _kind = model_validator(mode="before")(kind_check("bench"))
     cases: Entries[BenchCase]
 
     @property
@@ -155,7 +155,7 @@ class Bench(Model):
             short = [one for one in figures if one["measured"] is None]
         for one in short:
             problem = f"{one['case']}: {one['problem']}"
-            console.print(annotation(problem, path) if in_workflow() else problem)
+            console.print(annotation(problem, path) if runs_in_workflow() else problem)
         if short:
             sys.exit(1)
 

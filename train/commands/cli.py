@@ -23,11 +23,11 @@ from rich.text import Text
 import elastic_env
 from elastic_env.core.config_problems import ModelError
 from elastic_env.core.errors import shorten
-from train.runs.annotations import annotation, in_workflow
-from train.runs.console import PlainConsole, traceback_of, visible_warnings
-from train.runs.failures import DEFECT, EndedError, explain
-from train.runs.import_path import leave
-from train.runs.progress import say_what_is_compiled
+from train.runs.annotations import annotation, runs_in_workflow
+from train.runs.console import PlainConsole, traceback_text, visible_warnings
+from train.runs.failures import DEFECT, SignalError, explain
+from train.runs.import_path import remove_from_path
+from train.runs.progress import announce_compilation
 
 COMMANDS = (
     "identify evaluate compare train iterate export bench speed margins play view robot hardware"
@@ -50,12 +50,12 @@ def _print_failure(error: Exception) -> int:
     """Say what failed; the exit code."""
     found = explain(error)
     if found is None:
-        sys.stderr.write(traceback_of(error))
+        sys.stderr.write(traceback_text(error))
         kind = type(error).__name__
         found = f"this is a defect of elastic-env, please report it: {kind}", DEFECT
     said, code = found
     _print_last(said, error, "error: ")
-    if in_workflow():
+    if runs_in_workflow():
         CONSOLE.print(annotation(said))
     return code
 
@@ -74,7 +74,7 @@ def _ended_by(*numbers: int) -> Iterator[None]:
         now = time.monotonic()
         if now - asked_s > _SAME_WISH_S:
             asked_s = now
-            raise EndedError(number)
+            raise SignalError(number)
 
     handled = {}
     is_main = threading.current_thread() is threading.main_thread()
@@ -174,7 +174,7 @@ def main(arguments: list[str] | None = None) -> None:
 
     def work() -> None:
         command = parse(sys.argv[1:] if arguments is None else arguments)
-        with say_what_is_compiled(CONSOLE), visible_warnings():
+        with announce_compilation(CONSOLE), visible_warnings():
             command.run(CONSOLE)
 
     run_program(work)
@@ -189,14 +189,14 @@ def run_program(work: Callable[[], None]) -> None:
     """
     with _ended_by(signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         try:
-            leave(Path.cwd())
+            remove_from_path(Path.cwd())
             work()
         except BrokenPipeError:
             raise  # nobody reads any more: not worth a word
         except Exception as error:
             sys.exit(_print_failure(error))
         except KeyboardInterrupt as error:
-            number = error.args[0] if isinstance(error, EndedError) else signal.SIGINT
+            number = error.args[0] if isinstance(error, SignalError) else signal.SIGINT
             said = f"ended by {signal.Signals(number).name}"
             _print_last("interrupted" if number == signal.SIGINT else said, error)
             # worker processes must not keep the terminal waiting

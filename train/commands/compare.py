@@ -49,7 +49,7 @@ from train.report.write import require_libraries, write_report
 from train.runs import folders
 from train.runs.console import print_files, warn_once
 from train.runs.presets import find_configuration, print_presets
-from train.runs.user_code import CodeNamingModel, is_a, recorded_config
+from train.runs.user_code import CodeNamingModel, kind_check, recorded_config
 from train.speed.step_times import step_times
 from train.workers.executors import LOCAL_EXECUTORS, Executors
 
@@ -132,7 +132,7 @@ class CompareConfig(CodeNamingModel):
         return {"references": motions or default, **values}
 
     # the last one runs first
-    _kind = model_validator(mode="before")(is_a("comparison"))
+    _kind = model_validator(mode="before")(kind_check("comparison"))
 
     @field_validator("policies", mode="before")
     @classmethod
@@ -395,7 +395,7 @@ def _open_run(config: CompareConfig, output: Path | None, resumes: bool) -> Iter
         return
     folders.require_run(output)
     with folders.lock_run(output):
-        folders.describe(output, *recorded)
+        folders.record_run(output, *recorded)
         yield output
 
 

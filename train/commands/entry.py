@@ -9,7 +9,7 @@ from pathlib import Path
 
 from train.runs import failures
 from train.runs.escaping import visible
-from train.runs.import_path import ShadowedError, leave, safe_children
+from train.runs.import_path import ShadowedError, isolate_children, remove_from_path
 
 _UNREAD = 128 + signal.SIGPIPE
 
@@ -35,7 +35,7 @@ def start(run: Callable[[], None]) -> None:
     try:
         try:
             _leave_working_folder()  # before anything else is imported
-            with safe_children():
+            with isolate_children():
                 run()
         finally:
             sys.stdout.flush()
@@ -44,7 +44,7 @@ def start(run: Callable[[], None]) -> None:
         sys.exit(failures.WRONG_INPUT)
     except SystemExit as error:
         # the console of rich ends the program with 1 by itself
-        if failures.is_unread(error):
+        if failures.is_closed_pipe(error):
             _end_without_output(BrokenPipeError())
         raise
     except (KeyboardInterrupt, ImportError) as error:
@@ -58,7 +58,7 @@ def start(run: Callable[[], None]) -> None:
 
 def _leave_working_folder() -> None:
     """Import nothing from the working folder, here and in the processes that are started."""
-    leave(Path.cwd())
+    remove_from_path(Path.cwd())
     from elastic_env.hardware.safety.processes import child_environment
 
     kept = child_environment()

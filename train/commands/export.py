@@ -236,11 +236,11 @@ class Sb3(Model):
         from elastic_env.core.config import load_yaml
         from train.learn.export import export_zip
         from train.learn.train_config import TrainConfig
-        from train.runs.folders import own_folder
+        from train.runs.folders import result_folder
         from train.runs.presets import find_configuration
 
         config = load_yaml(find_configuration(self.config, "training"), TrainConfig)
-        with own_folder(self.model.stem, self.output) as folder:
+        with result_folder(self.model.stem, self.output) as folder:
             export_zip(self.model, config, folder, self.normaliser, self.trust_pickle)
         console.print(f"play it as residual:{folder}")
 

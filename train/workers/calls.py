@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from elastic_env.core.errors import ConfigurationError, ElasticError, SystemFailedError
-from train.runs.import_path import leave
+from train.runs.import_path import remove_from_path
 from train.workers.versions import VersionsDifferError, everything, require_same
 
 MOST_MOVES = 2
@@ -248,7 +248,7 @@ def carry_out(
         require_same(versions, everything(), platform.node())
         if folder.is_dir():
             os.chdir(folder)
-            leave(folder)
+            remove_from_path(folder)
         report(0)
         return Outcome(function(*given, report))
     except Exception as error:

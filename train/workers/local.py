@@ -15,7 +15,7 @@ from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from typing import Any
 
-from train.runs.import_path import safe_children
+from train.runs.import_path import isolate_children
 from train.workers import calls
 
 _SPAWN = multiprocessing.get_context("spawn")
@@ -31,7 +31,7 @@ def local_pool(jobs: int) -> Iterator[calls.Pool]:
     if getattr(multiprocessing.current_process(), "_inheriting", False):
         # this is a worker that imports the script of its parent, which says why it ended
         sys.exit(1)
-    with safe_children():
+    with isolate_children():
         # its start lets SIGINT through; the threads that start workers block it
         resource_tracker.ensure_running()
     processes = _Processes(jobs)
@@ -114,7 +114,7 @@ class _Worker:
     def __init__(self) -> None:
         self.pipe, end = _SPAWN.Pipe()
         self.process = _SPAWN.Process(target=_serve, args=(end,))
-        with safe_children():
+        with isolate_children():
             self.process.start()
         end.close()  # with that of the process the pipe ends too
         self._has_begun = False
