@@ -205,7 +205,7 @@ def _require_shadow_is_named(command: list[str], own: Path) -> None:
     run = subprocess.run(
         command, cwd=own.parent, env=env, capture_output=True, text=True, check=False
     )
-    problem = f"{own / 'baselines.py'} is imported instead of the package baselines"
+    problem = f"{own / 'baselines.py'} stands in the place of the package baselines"
     if run.returncode == 0 or problem not in run.stderr:
         raise ConfigurationError(f"{' '.join(command)} must say: {problem}; got:\n{run.stderr}")
 

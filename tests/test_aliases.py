@@ -56,5 +56,5 @@ def test_a_module_of_the_user_in_their_place_is_named(shadow: str, tmp_path: Pat
     assert not run.stdout
     last = run.stderr.splitlines()[-1]
     assert last.startswith(f"ImportError: {tmp_path}/baselines")
-    assert "is imported instead of the package baselines of elastic-env" in last
+    assert "stands in the place of the package baselines of elastic-env" in last
     assert "rename it" in last

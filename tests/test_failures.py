@@ -24,7 +24,7 @@ from train.evaluate.conditions import Condition, PolicySpec
 from train.evaluate.rollout import PolicyFailedError, policy_errors
 from train.runs.failures import SignalError, explain
 from train.runs.progress import duration, plain_progress
-from train.workers.calls import WorkerKilledError
+from train.workers.pool import WorkerKilledError
 
 CONFIGS = Path(__file__).parents[1] / "configs"
 POLICIES = """

@@ -153,7 +153,7 @@ def test_a_file_that_stands_before_a_package_is_named(tmp_path: Path) -> None:
     run = elastic(tmp_path / "work", "evaluate", "--help", PYTHONPATH=str(tmp_path))
     assert run.returncode == 2
     assert run.stderr.startswith(
-        f"error: {tmp_path / 'baselines.py'} is imported instead of the package baselines"
+        f"error: {tmp_path / 'baselines.py'} stands in the place of the package baselines"
     )
     assert len(run.stderr.splitlines()) == 1
 

@@ -50,7 +50,7 @@ def _require_own_packages() -> None:
         file = Path(origin).resolve() if origin else None
         if file != expected:
             raise ShadowedError(
-                f"{file or name} is imported instead of the package {name} of elastic-env,"
+                f"{file or name} stands in the place of the package {name} of elastic-env,"
                 f" {expected.parent}; rename it, or take its folder out of PYTHONPATH"
             )
 
