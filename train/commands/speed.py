@@ -14,13 +14,15 @@ import numpy as np
 from pydantic import Field
 from rich.console import Console
 
-import train.speed.contenders as loops
 from elastic_env.core.config import Entries, Model, quantity
 from train.evaluate.environments import environment
 from train.runs.console import make_table
 from train.runs.escaping import write_records
 from train.runs.folders import run_folder
 from train.runs.progress import plain_progress
+from train.speed.contenders import Contender, RawWorlds, ScalarLoop, VectorLoop
+from train.speed.foreign_loops import IN_PROCESSES, IN_THIS_PROCESS, ForeignLoop
+from train.speed.ppo_loop import PPOLoop
 from train.speed.real_time import PERCENTILES, play_against_the_clock
 
 _PPO_PROCESSES = 2
@@ -91,11 +93,11 @@ class Speed(Model):
         """The policy in the loop: the named one, or the environment's best that needs no truth."""
         return self.policy or environment(self.env).looped_policy
 
-    def vector_loop(self, num_envs: int, policy: str | None, residual: bool) -> loops.VectorLoop:
+    def vector_loop(self, num_envs: int, policy: str | None, residual: bool) -> VectorLoop:
         """The vector environment with a policy, and perhaps a network, in its loop."""
         threads = min(self.threads_used, num_envs)
         where = {"backend": self.backend, "device": self.device}
-        return loops.VectorLoop(self.env, num_envs, threads, policy, residual, **where)
+        return VectorLoop(self.env, num_envs, threads, policy, residual, **where)
 
     def run(self, console: Console) -> None:
         """Measure, print, and write what was measured."""
@@ -202,14 +204,14 @@ def measure(config: Speed, progress: Callable[[float], None]) -> list[dict[str, 
     ]
 
 
-def _contenders(config: Speed) -> tuple[list[loops.Contender], list[int]]:
+def _contenders(config: Speed) -> tuple[list[Contender], list[int]]:
     """Contenders, and for each the number of the one that it is compared with.
 
     The two are beside each other in turn, where that one is for it alone.
     """
     env = config.env
     policy = config.looped_policy
-    contenders: list[loops.Contender] = []
+    contenders: list[Contender] = []
     against: list[int] = []
     for n in config.num_envs:
         threads = min(config.threads_used, n)
@@ -217,19 +219,19 @@ def _contenders(config: Speed) -> tuple[list[loops.Contender], list[int]]:
         with_policy = config.vector_loop(n, policy, residual=False)
         with_network = config.vector_loop(n, policy, residual=True)
         against += [len(contenders) + 1] * 4
-        contenders += [loop, loops.RawWorlds(loop, threads), with_policy, with_network]
+        contenders += [loop, RawWorlds(loop, threads), with_policy, with_network]
     if config.others:
-        scalar = loops.ScalarLoop(env)
+        scalar = ScalarLoop(env)
         against += [len(contenders) + 1] * 2
-        contenders += [scalar, loops.RawWorlds(scalar, 1)]
-        foreign = [(kind, n) for n in config.processes for kind in loops.IN_PROCESSES]
-        foreign += [(kind, config.processes[0]) for kind in loops.IN_THIS_PROCESS]
+        contenders += [scalar, RawWorlds(scalar, 1)]
+        foreign = [(kind, n) for n in config.processes for kind in IN_PROCESSES]
+        foreign += [(kind, config.processes[0]) for kind in IN_THIS_PROCESS]
         against += [0] * len(foreign)
-        contenders += [loops.ForeignLoop(env, kind, n) for kind, n in foreign]
+        contenders += [ForeignLoop(env, kind, n) for kind, n in foreign]
     if config.ppo:
         against += [len(contenders)] * 2
-        contenders.append(loops.PPOLoop(env, policy, 64, config.threads_used))
-        contenders.append(loops.PPOLoop(env, policy, _PPO_PROCESSES, None))
+        contenders.append(PPOLoop(env, policy, 64, config.threads_used))
+        contenders.append(PPOLoop(env, policy, _PPO_PROCESSES, None))
     return contenders, against
 
 

@@ -16,13 +16,7 @@ from multiprocessing.connection import Connection
 from typing import Any
 
 from train.runs.import_path import isolate_children
-from train.workers.pool import (
-    CallFailedError,
-    Outcome,
-    Pool,
-    UnguardedScriptError,
-    WorkerLostError,
-)
+from train.workers.pool import CallFailedError, Outcome, Pool, UnguardedScriptError, WorkerLostError
 
 _SPAWN = multiprocessing.get_context("spawn")
 
