@@ -21,8 +21,9 @@ from elastic_env.core.errors import ConfigurationError, SystemFailedError
 from elastic_env.core.files import flush
 from tests.cluster_trials import SINE, dask_cluster, free_port
 from tests.test_training import PPO, SMALL, weights
+from train.cells.cell_key import cell_key
 from train.cells.play import run_conditions
-from train.cells.store import Store, cell_key
+from train.cells.store import Store
 from train.commands.cli import main
 from train.evaluate.conditions import Condition, PolicySpec
 from train.evaluate.episodes import Evaluation, evaluate, evaluate_together

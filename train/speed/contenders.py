@@ -34,7 +34,7 @@ class Contender(ABC):
 
     @abstractmethod
     def run(self, steps: int) -> float:
-        """Play about `steps` control steps in every world; return steps per second of all worlds."""
+        """Play about `steps` control steps in each world; return steps per second of all worlds."""
 
     def close(self) -> None:
         """Close the environment."""

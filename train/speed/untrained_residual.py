@@ -13,7 +13,7 @@ from baselines.residual.settings import ResidualDescription, ResidualSettings
 
 
 def untrained_residual(base: Any, env: Any) -> ResidualPolicy:
-    """Return a residual on a base policy: an untrained network, 64×64, with small random weights."""
+    """Return a residual on a base policy: an untrained network, 64×64, small random weights."""
     model = env.unwrapped.assumed_model
     corrected = Corrected(base, model, ResidualSettings(acts_on=residual_input(base)))
     features = Features(corrected).width
