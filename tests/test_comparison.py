@@ -51,7 +51,7 @@ from train.figures.comparison_figures import has_swept_references
 from train.report.change_tables import cells_table, changes_table, print_changes, write_statistics
 from train.report.page import Page
 from train.report.report_text import Results
-from train.report.table_formats import to_terminal
+from train.report.terminal import to_terminal
 from train.report.write import require_libraries, require_plotly, write_report
 from train.runs.folders import run_folder
 

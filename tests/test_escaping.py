@@ -23,9 +23,9 @@ from rich.text import Text
 
 from train.figures import plots
 from train.figures.chart import Chart, Curve, Panel
+from train.report.markdown import to_markdown
 from train.report.page import Page
-from train.report.table_formats import Table as ReportTable
-from train.report.table_formats import to_markdown
+from train.report.tables import Table as ReportTable
 from train.runs.console import PlainConsole, traceback_text, visible_warnings
 from train.runs.escaping import (
     chart_text,

@@ -38,7 +38,7 @@ from train.report.leaderboard import (
     write_leaderboard,
 )
 from train.report.report_text import Results
-from train.report.table_formats import Cell, Table, plain_text
+from train.report.tables import Cell, Table, plain_text
 from train.report.write import write_report
 from train.runs.folders import run_folder
 from train.speed.step_times import step_times

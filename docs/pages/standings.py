@@ -5,7 +5,8 @@ from dataclasses import replace
 
 from train.evaluate.standings import Standing
 from train.report.leaderboard import board
-from train.report.table_formats import Cell, parts_of, to_markdown
+from train.report.markdown import to_markdown
+from train.report.tables import Cell, parts_of
 
 _JUDGED = (
     ("mixture", "3 s"),

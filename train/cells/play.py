@@ -78,9 +78,7 @@ def run_conditions(
         number = len(conditions) - len(missing)
         console.print(f"{number} of {len(conditions)} cells are kept")
     played = iter(_BatchRun(missing, console, place, store).outcomes() if missing else [])
-    outcomes = [
-        next(played) if stored_cell is None else Outcome(stored_cell) for stored_cell in stored
-    ]
+    outcomes = [next(played) if cell is None else Outcome(cell) for cell in stored]
     finished = [outcome.value for outcome in outcomes if outcome and outcome.error is None]
     failures = dict(
         _explain_failure(condition, outcome)

@@ -37,7 +37,9 @@ from train.evaluate.conditions import (
 from train.evaluate.episodes import Evaluation, group_by
 from train.evaluate.statistics import Estimate
 from train.evaluate.table import over_cells
-from train.report.table_formats import Head, Row, Table, print_table, to_markdown
+from train.report.markdown import to_markdown
+from train.report.tables import Head, Row, Table
+from train.report.terminal import print_table
 from train.runs.annotations import annotation, runs_in_workflow
 from train.runs.folders import run_folder
 from train.runs.user_code import CodeNamingModel, kind_check, load_without_code

@@ -25,7 +25,7 @@ from train.report import summary
 from train.report.page import TEXTS, Page
 from train.report.report_text import capital
 from train.report.specs import page_chart
-from train.report.table_formats import Table
+from train.report.tables import Table
 from train.report.write import require_libraries, write_page
 from train.runs.console import make_table, print_files
 from train.runs.folders import run_folder

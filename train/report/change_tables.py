@@ -12,7 +12,8 @@ from train.evaluate.changes import Change, by_line, percent_interval, signed_int
 from train.evaluate.episodes import group_by
 from train.evaluate.maps import HeatMap
 from train.evaluate.statistics import Estimate, named_intervals
-from train.report.table_formats import Cell, Head, Part, Row, Table, number_interval, print_table
+from train.report.tables import Cell, Head, Part, Row, Table, number_interval
+from train.report.terminal import print_table
 from train.runs.escaping import write_records
 
 _SIGNS = {

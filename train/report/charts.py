@@ -13,7 +13,7 @@ from train.evaluate.table import EpisodeTable, failures, score
 from train.figures.colours import INK, LINE, VERDICTS
 from train.report import specs
 from train.report.specs import LONGEST_NAME, Spec, base_axis
-from train.report.table_formats import number_interval
+from train.report.tables import number_interval
 from train.runs.escaping import chart_text
 
 

@@ -21,7 +21,8 @@ from train.evaluate.standings import Paired, Standing
 from train.evaluate.statistics import Estimate
 from train.report.page import TEXTS, Page
 from train.report.report_text import capital
-from train.report.table_formats import Head, Part, Row, Table, print_table
+from train.report.tables import Head, Part, Row, Table
+from train.report.terminal import print_table
 from train.runs.escaping import write_records
 
 COLUMNS = {

@@ -22,7 +22,7 @@ from train.evaluate.standings import Standing
 from train.evaluate.statistics import Estimate
 from train.evaluate.table import EpisodeTable, failures
 from train.figures.colours import policy_colours
-from train.report.table_formats import load_template
+from train.report.templates import load_template
 
 
 @dataclass(frozen=True)

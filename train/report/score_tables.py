@@ -14,7 +14,8 @@ from train.evaluate.robots import RobotScores
 from train.evaluate.statistics import Estimate
 from train.evaluate.table import EpisodeTable, by_episode, score
 from train.figures.chart import quantiles
-from train.report.table_formats import Head, Row, Table, number_interval, print_table
+from train.report.tables import Head, Row, Table, number_interval
+from train.report.terminal import print_table
 from train.runs.escaping import write_records
 
 

@@ -15,18 +15,10 @@ from train.evaluate.environments import Column
 from train.evaluate.episodes import Evaluation
 from train.evaluate.statistics import Estimate
 from train.evaluate.table import median_of
-from train.report.page import bullets
+from train.report.markdown import bullets, to_markdown
 from train.report.report_text import capital
-from train.report.table_formats import (
-    Head,
-    Row,
-    Table,
-    column_notes,
-    has_room,
-    number_interval,
-    print_table,
-    to_markdown,
-)
+from train.report.tables import Head, Row, Table, column_notes, number_interval
+from train.report.terminal import has_room, print_table
 from train.runs.escaping import write_records
 
 

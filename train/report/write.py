@@ -21,7 +21,8 @@ from train.report.report_text import Results, capital, facts, sentences
 from train.report.score_tables import learning_table, robots_table, scores_table
 from train.report.specs import page_chart
 from train.report.summary import bound_notes
-from train.report.table_formats import Table, load_template
+from train.report.tables import Table
+from train.report.templates import load_template
 
 _LONG = 40
 """Rows from which on a table is folded away."""
