@@ -129,14 +129,12 @@ class Bench(Model):
         if path == _SHIPPED:
             console.print(f"there is no {USUAL}; these are the rollouts of the package")
         if self.config is None:  # it was found, and nobody named it
-            cure = f"name it: elastic bench {path}"
-            config = load_without_code(path, BenchConfig, cure)
+            config = load_without_code(path, BenchConfig, f"name it: elastic bench {path}")
         else:
             config = load_yaml(path, BenchConfig)
         recorded = config.model_dump(mode="json")
         with run_folder(config.name, recorded, None, self.output) as folder:
-            conditions = [case.condition for case in config.cases]
-            evaluations = run_conditions(conditions, console)
+            evaluations = run_conditions([case.condition for case in config.cases], console)
             figures = list[_Figure]()
             for case, evaluation in zip(config.cases, evaluations, strict=True):
                 figures += _figures(case, evaluation, config.margin)

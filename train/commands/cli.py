@@ -146,8 +146,7 @@ def _parse_overview(arguments: list[str]) -> Any:
     """Print the help of all commands, which are not loaded for it, or refuse an unknown command."""
     members: Any = []
     for name in COMMANDS.split():
-        described = {"__doc__": _help_of(name)}
-        kind = dataclasses.make_dataclass(name, [], namespace=described)
+        kind = dataclasses.make_dataclass(name, [], namespace={"__doc__": _help_of(name)})
         members.append(Annotated[kind, tyro.conf.subcommand(name)])
     union = functools.reduce(operator.or_, members)
     cli = functools.partial(tyro.cli, description=_OVERVIEW, config=_STYLE)

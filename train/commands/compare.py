@@ -155,8 +155,7 @@ class CompareConfig(CodeNamingModel):
         walks = environment(self.env).walks
         played = [make_scenario(name, walks, self.ranges) for name in self.scenarios]
         protocol["scenarios"] = [own.model_dump(mode="json") for own in played]
-        text = json.dumps(protocol, sort_keys=True)
-        digest = hashlib.sha256(text.encode()).hexdigest()[:16]
+        digest = hashlib.sha256(json.dumps(protocol, sort_keys=True).encode()).hexdigest()[:16]
         packages = ("elastic-env", "mujoco")
         versions = [f"{name} {folders.installed_version(name)}" for name in packages]
         return "; ".join([*versions, f"protocol {digest}"])
@@ -337,8 +336,7 @@ def compare(
         board = []
         if config.leaderboard:
             console.print("measuring the time of every policy, in turn")
-            times = step_times(conditions)
-            board = standings(evaluations, config.groups, times, config.origin)
+            board = standings(evaluations, config.groups, step_times(conditions), config.origin)
             if published:
                 board = append_standings(published, board)
         if robots:
@@ -381,8 +379,7 @@ def _require_new(config: CompareConfig, published: Sequence[Standing]) -> None:
     if again:
         cure = "name your own by --policies, or give it a label in a configuration"
         raise ConfigurationError(f"{quote(again[0])} is published already; {cure}")
-    own = [replace(published[0], origin=config.origin)]
-    append_standings(published, own)
+    append_standings(published, [replace(published[0], origin=config.origin)])
 
 
 @contextmanager

@@ -168,12 +168,11 @@ _POINTS = 1500
 def _testbed_rows(result: Identification, static: Cells) -> Rows:
     stiffness = f"{result.stiffness_nm_per_rad:.1f}"
     interval = f"{result.stiffness_low_nm_per_rad:.1f} to {result.stiffness_high_nm_per_rad:.1f}"
-    line = f"{result.line_stiffness_nm_per_rad:.1f}"
     rows = [
         ("true stiffness of the plant [N·m/rad]", "1001", "-"),
         ("identified stiffness [N·m/rad]", stiffness, "1001"),
         ("  95 % interval", interval, "-"),
-        ("  plain line", line, "1001"),
+        ("  plain line", f"{result.line_stiffness_nm_per_rad:.1f}", "1001"),
         ("friction [N·m]", f"{result.friction_nm:.2f}", "-"),
         ("Pearson r", f"{result.pearson_r:.4f}", "0.9775"),
     ]

@@ -199,8 +199,7 @@ class Onnx(Output):
         layout = ResidualLayout.of(self.residual, self.env)
         output = self.output or Path(f"{_short_name(self.residual)}.onnx")
         if output.suffix != ".onnx":
-            problem = f"a graph of ONNX is a file .onnx, got {shorten(output)}"
-            raise ConfigurationError(problem)
+            raise ConfigurationError(f"a graph of ONNX is a file .onnx, got {shorten(output)}")
         vector = {output.with_suffix(".npz"): played_vector(layout)}
         self.write({output: onnx_model(layout), **vector}, console)
 

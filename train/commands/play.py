@@ -45,8 +45,7 @@ def play(
         MissingExtraError: The video writer is not installed.
     """
     mode = "human" if video is None else "rgb_array"
-    name = condition.environment.id
-    env: Any = gymnasium.make(name, render_mode=mode, **condition.arguments)
+    env: Any = gymnasium.make(condition.environment.id, render_mode=mode, **condition.arguments)
     task = env.unwrapped.task
     period = task.assumed_model.control_period_s
     with closing(env):

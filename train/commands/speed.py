@@ -126,8 +126,7 @@ def measure_real_time(config: Speed, console: Console) -> Path:
         (label, *(f"{found[f'{key}_{name}_us']:.0f}" for name in PERCENTILES))
         for key, label in _TIMES.items()
     ]
-    head = ["", "median", "99 %", "99.9 %", "longest"]
-    console.print(make_table(title, head, rows))
+    console.print(make_table(title, ["", "median", "99 %", "99.9 %", "longest"], rows))
     share = 100.0 * found["late_share"]
     console.print(f"late: {found['late']} of {found['cycles']} cycles, {share:.3f} %")
     if not found["is_real_time"]:
@@ -141,8 +140,7 @@ def measure_throughput(config: Speed, console: Console) -> Path:
         # what is missing is said before the work
         importlib.import_module("stable_baselines3")
     config.vector_loop(1, config.policy, residual=False)
-    unused = {"output", "profile", "real_time", "seconds"}
-    recorded = config.model_dump(mode="json", exclude=unused)
+    recorded = config.model_dump(mode="json", exclude={"output", "profile", "real_time", "seconds"})
     with run_folder("speed", recorded, None, config.output) as folder:
         console.print("measuring every contender in turn, round by round")
         results = measure(config, plain_progress(console))

@@ -92,12 +92,10 @@ def changes_table(rows: Sequence[Change], colours: Mapping[str, str]) -> Table:
     heads += [Head("95 % over"), Head(f"{rows[0].failure} (base)")]
     heads += [Head("what it shows", is_number=False)] * is_family
     lines = []
-    blocks = group_by(rows, lambda row: (row.policy, row.base))
-    for (policy, base), block in blocks.items():
+    for (policy, base), block in group_by(rows, lambda row: (row.policy, row.base)).items():
         number = block[0].num_seeds
         seeds = f", {number} training seed{'s' * (number != 1)}" if is_family else ""
-        title = f"{policy} against {base}{seeds}"
-        lines.append(Row((title,), kind="heading", dot=colours[policy]))
+        lines.append(Row((f"{policy} against {base}{seeds}",), kind="heading", dot=colours[policy]))
         for row in (row for line in by_line(block) for row in line):
             failed = Part(_failures(row), "failure" if row.falls_more else "")
             cells: list[Cell] = [row.reference, _scope(row)]

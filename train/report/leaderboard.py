@@ -116,8 +116,7 @@ def _entry(
             low, high = map(three_digits, score.ends)
             intervals.append(Part(f"[{low}, {high}]", "small"))
     if standings[0].failed:
-        failed = f"✕{standings[0].failed}/{standings[0].episodes}"
-        parts.append(Part(failed, "failure", before=" "))
+        parts.append(Part(f"✕{standings[0].failed}/{standings[0].episodes}", "failure", before=" "))
     return (*parts, *intervals)
 
 
@@ -188,8 +187,7 @@ def add_leaderboard(page: Page, standings: Sequence[Standing]) -> None:
         page.add("table", claims)
     single = scenarios_table(standings)
     if single is not None:
-        title = f"Single scenarios, {standings[0].reference}"
-        page.add("table", single, title, is_folded=True)
+        page.add("table", single, f"Single scenarios, {standings[0].reference}", is_folded=True)
 
 
 def leaderboard_markdown(standings: Sequence[Standing]) -> str:

@@ -26,8 +26,7 @@ def to_markdown(table: Table) -> str:
 def _markdown_cell(cell: Cell) -> str:
     text = ""
     for part in parts_of(cell):
-        look = _LOOKS.get(part.style, "{}")
-        text += part.before + look.format(markdown_text(part.text))
+        text += part.before + _LOOKS.get(part.style, "{}").format(markdown_text(part.text))
     return text
 
 

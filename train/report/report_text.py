@@ -95,8 +95,7 @@ class Results:
     @property
     def compared_pairs(self) -> list[list[Change]]:
         """`judged_changes` by residual and kind of opponent."""
-        pairs = group_by(self.judged_changes, lambda row: (row.policy, row.is_rival))
-        return list(pairs.values())
+        return list(group_by(self.judged_changes, lambda row: (row.policy, row.is_rival)).values())
 
     @property
     def rivalled_residuals(self) -> set[str]:
@@ -140,8 +139,7 @@ def sentences(kind: Literal["headline", "in_short", "notes"], results: Results) 
         "marks": [kind for kind in kinds if any(mark.startswith(kind) for mark in marks)],
         "verdict_words": _VERDICTS,
     }
-    module = load_template("sentences.j2").make_module(helpers)
-    text = getattr(module, kind)(results)
+    text = getattr(load_template("sentences.j2").make_module(helpers), kind)(results)
     parts = [re.sub(r"[ \n]+", " ", part).strip() for part in text.split("\n\n")]
     return list(filter(None, parts))
 

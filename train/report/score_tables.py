@@ -22,8 +22,7 @@ from train.runs.escaping import write_records
 def scores_table(table: EpisodeTable, columns: Sequence[Column]) -> Table:
     """Return the mean of every policy in every cell, with intervals."""
     rows = []
-    places = product(table.references, table.scenarios, table.policies)
-    for reference, scenario, policy in places:
+    for reference, scenario, policy in product(table.references, table.scenarios, table.policies):
         for cell in table.cells_of(policy, reference, scenario):
             condition = table.conditions[policy, cell]
             episodes = table.of(policy, cell)

@@ -135,15 +135,13 @@ def _parts(evaluations: Sequence[Evaluation]) -> list[str]:
     interval = _interval_label(evaluations)
     worst = f"{interval} (the worst of them)" if interval else ""
     statistic = f"Median over the episodes that did not fail{worst}"
-    legend = [*column_notes(environment.columns), *filter(None, [environment.note])]
     parts = [
         f"{capital(environment.subject)}. {statistic}; failures are counted beside.",
-        " ".join(legend),
+        " ".join([*column_notes(environment.columns), *filter(None, [environment.note])]),
         to_markdown(summary_table(evaluations, environment.columns, worst=True)),
     ]
     for title, columns in environment.splits.items():
-        table = summary_table(evaluations, columns, worst=True)
-        parts += [f"{title}:", to_markdown(table)]
+        parts += [f"{title}:", to_markdown(summary_table(evaluations, columns, worst=True))]
     if notes := failure_notes(evaluations):
         parts += ["Where all episodes failed:", bullets(notes)]
     return [*parts, *bound_notes(evaluations)]

@@ -128,8 +128,7 @@ class Table:
             cells = row.cells[:place] + row.cells[place + 1 :]
             rows.append(row if row.kind == "heading" else replace(row, cells=cells))
         heads = self.heads[:place] + self.heads[place + 1 :]
-        keys = self.keys - (place < self.keys)
-        return replace(self, heads=heads, rows=tuple(rows), keys=keys)
+        return replace(self, heads=heads, rows=tuple(rows), keys=self.keys - (place < self.keys))
 
     @property
     def sparse_rows(self) -> list[Row]:

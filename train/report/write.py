@@ -147,8 +147,7 @@ def _add_changes(page: Page, results: Results) -> None:
         _add_table(page, changes_table(rows, results.colours), "Table of changes")
     if others:
         page.section(name_of_others, TEXTS["differences"])
-        table = changes_table(others, results.colours)
-        _add_table(page, table, "Table of differences")
+        _add_table(page, changes_table(others, results.colours), "Table of differences")
 
 
 def _add_table(page: Page, table: Table, title: str = "Table") -> None:

@@ -43,8 +43,7 @@ def csv_cell(value: Any) -> Any:
     if not isinstance(value, str):
         return value
     text = visible(value)
-    is_formula = text.startswith(_FORMULA) and not _NUMBERS.fullmatch(text)
-    return f"'{text}" if is_formula else text
+    return f"'{text}" if text.startswith(_FORMULA) and not _NUMBERS.fullmatch(text) else text
 
 
 def write_csv(head: Sequence[str], rows: Iterable[Iterable[Any]], path: Path) -> Path:

@@ -155,8 +155,7 @@ def named_object(name: str) -> Any:
     if not hasattr(module, attribute):
         _require_unshadowed(module, attribute)
         functions = inspect.getmembers(module, inspect.isfunction)
-        classes = inspect.getmembers(module, inspect.isclass)
-        members = [*functions, *classes]
+        members = [*functions, *inspect.getmembers(module, inspect.isclass)]
         names = [name for name, member in members if member.__module__ == module.__name__]
         if not names:
             problem = f"{shorten(source)} has no {attribute!r}"

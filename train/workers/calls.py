@@ -170,8 +170,7 @@ def _outcome(future: Future[Any]) -> Outcome:
         return future.result()
     if type(error).__name__ == "KilledWorker":  # of dask, which moves calls itself
         return Outcome(error=WorkerKilledError())
-    is_plain = isinstance(error, Exception)
-    return Outcome(error=error if is_plain else CallFailedError(repr(error)))
+    return Outcome(error=error if isinstance(error, Exception) else CallFailedError(repr(error)))
 
 
 @contextmanager

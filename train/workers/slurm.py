@@ -163,5 +163,4 @@ def _set_result(future: "Future[Any]", job: Any) -> None:
     try:
         future.set_result(job.result())
     except Exception as error:  # the job was killed, or out of time or memory
-        problem = f"job {job.job_id} ended without a result: {error}"
-        future.set_exception(WorkerLostError(problem))
+        future.set_exception(WorkerLostError(f"job {job.job_id} ended without a result: {error}"))
