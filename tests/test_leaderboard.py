@@ -13,14 +13,14 @@ import pytest
 import yaml
 from rich.console import Console
 
-import train.commands.compare
+import train.commands.comparison
 import train.speed.step_times
 from baselines.catalogue import Track
 from elastic_env.core.config import load_yaml
 from elastic_env.core.errors import ConfigurationError
 from tests.cells import METRIC, cell, family
 from train.commands.cli import main
-from train.commands.compare import CompareConfig, Sweep
+from train.commands.compare_config import CompareConfig, Sweep
 from train.evaluate.changes import changes
 from train.evaluate.conditions import Condition, PolicySpec
 from train.evaluate.episodes import Evaluation, evaluate
@@ -413,11 +413,11 @@ def play_quickly(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         played.extend(condition.policy.title for condition in conditions)
         return [evaluate(condition, num_threads=1) for condition in conditions]
 
-    monkeypatch.setattr(train.commands.compare, "run_conditions", run)
+    monkeypatch.setattr(train.commands.comparison, "run_conditions", run)
     monkeypatch.setattr(
-        train.commands.compare, "step_times", lambda cells: step_times(cells, steps=2, rounds=1)
+        train.commands.comparison, "step_times", lambda cells: step_times(cells, steps=2, rounds=1)
     )
-    monkeypatch.setattr(train.commands.compare, "draw_figures", lambda *_: [])
+    monkeypatch.setattr(train.commands.comparison, "draw_figures", lambda *_: [])
     return played
 
 

@@ -21,7 +21,7 @@ from elastic_env.core.json_text import parse_json
 from elastic_env.world.physics import substeps
 from tests.mutations import RESIDUALS
 from train.commands.bench import BenchConfig
-from train.commands.compare import CompareConfig
+from train.commands.compare_config import CompareConfig
 from train.evaluate.conditions import PolicySpec
 from train.evaluate.environments import environment
 from train.evaluate.residual_seeds import expand

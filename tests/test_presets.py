@@ -8,7 +8,8 @@ import pytest
 from elastic_env.core.config import load_yaml
 from train.commands.bench import BenchConfig
 from train.commands.cli import main
-from train.commands.compare import CompareConfig, Comparison
+from train.commands.compare_config import CompareConfig
+from train.commands.comparison import Comparison
 from train.learn.train_config import TrainConfig
 from train.runs.presets import find_configuration, first_sentence, presets
 from train.runs.user_code import KINDS, kind_of

@@ -15,7 +15,7 @@ from rich.console import Console
 
 from elastic_env.core.errors import ConfigurationError, SystemFailedError
 from elastic_env.core.files import read_bounded, write_whole
-from train.commands.compare import CompareConfig
+from train.commands.compare_config import CompareConfig
 from train.learn.run_training import resume
 from train.runs.folders import (
     create_folder,

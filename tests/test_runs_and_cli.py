@@ -24,7 +24,7 @@ import yaml
 from PIL import Image, ImageSequence
 from rich.console import Console
 
-import train.commands.compare
+import train.commands.comparison
 import train.commands.demo
 import train.commands.speed
 import train.evaluate.episodes
@@ -38,7 +38,7 @@ from elastic_env.core.signals import Array
 from elastic_env.world.joint_task import METRICS_OF_ONE as METRICS
 from tests.test_identification import synthetic
 from train.commands.cli import main
-from train.commands.compare import CompareConfig
+from train.commands.compare_config import CompareConfig
 from train.commands.play import play
 from train.evaluate.conditions import Condition, PolicySpec
 from train.evaluate.episodes import Evaluation, evaluate
@@ -103,7 +103,7 @@ def in_process(monkeypatch: pytest.MonkeyPatch) -> None:
     def run(conditions: Sequence[Condition], console: Console, *_: object) -> list[Evaluation]:
         return [evaluate(condition, num_threads=1) for condition in conditions]
 
-    monkeypatch.setattr(train.commands.compare, "run_conditions", run)
+    monkeypatch.setattr(train.commands.comparison, "run_conditions", run)
     monkeypatch.setattr(train.commands.demo, "run_conditions", run)
 
 
@@ -488,7 +488,7 @@ def test_output_that_holds_results_is_refused_before_the_work(
     Path("taken").mkdir()
     Path("taken/notes.txt").write_text("keep me")
     for name in (
-        "train.commands.compare.run_conditions",
+        "train.commands.comparison.run_conditions",
         "train.commands.identify.identify",
         "train.commands.speed.measure",
     ):

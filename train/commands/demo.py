@@ -13,7 +13,7 @@ from baselines.identification.identify import Identification, identify_points
 from baselines.policies import is_saved
 from elastic_env.core.config import Model
 from train.cells.play import run_conditions
-from train.commands.compare import CompareConfig
+from train.commands.compare_config import CompareConfig
 from train.evaluate.conditions import PolicySpec
 from train.evaluate.episodes import Evaluation, group_by
 from train.evaluate.rollout import make_vector_env

@@ -5,7 +5,8 @@ from pathlib import Path
 from rich.console import Console
 
 from elastic_env.core.config import Model
-from train.commands.compare import CompareConfig, compare
+from train.commands.compare_config import CompareConfig
+from train.commands.comparison import compare
 from train.commands.options import MotionOrDefault, OnHardware, Stiffness, name_options
 from train.evaluate.conditions import NumEpisodes, PolicySpec, Seed
 from train.figures.plots import FigureFormat

@@ -11,7 +11,7 @@ from rich.console import Console
 
 from elastic_env.core.config import LARGEST_SEED, Entries, Locator, Model, Once, Title, quantity
 from elastic_env.core.files import write_whole
-from train.commands.compare import try_out
+from train.commands.comparison import try_out
 from train.commands.options import MotionOrDefault
 from train.evaluate.conditions import Condition, PolicySpec
 from train.evaluate.margins import (

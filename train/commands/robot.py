@@ -32,7 +32,8 @@ from elastic_env.robots.gallery import GALLERY, gallery_file, gallery_joints, ga
 from elastic_env.robots.joint_robot import JointRobotConfig
 from elastic_env.robots.robot.environment import configure_robot
 from elastic_env.world.joint_task import JointPlant
-from train.commands.compare import CompareConfig, compare
+from train.commands.compare_config import CompareConfig
+from train.commands.comparison import compare
 from train.commands.options import Motion, StiffnessOrFile
 from train.commands.play import play
 from train.evaluate.conditions import Condition, PolicySpec, Seed
