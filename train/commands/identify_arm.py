@@ -45,7 +45,7 @@ from elastic_env.core.errors import ConfigurationError, quote, unknown_name
 from elastic_env.joint.model_file import compiled_model, from_mujoco
 from elastic_env.joint.supported_models import commanded_hinges, hinges_of
 from elastic_env.world.robot_model import joint_ranges
-from train.commands.held_out import judge_poses, number_or_dash, show_held_out
+from train.commands.held_out import judge_poses, number_or_dash, print_held_out
 from train.commands.identify_geometry import identify_geometry
 from train.commands.identify_options import ArmOptions, IdentificationRun, ServoOptions
 from train.commands.identify_servo import identify_servo
@@ -132,7 +132,7 @@ def identify_arm(
         if plan is not None:
             files.append(_write_plan(setting.arm, plan, folder / "plan.csv"))
     if result.held_out is not None:
-        show_held_out(result.held_out, console)
+        print_held_out(result.held_out, console)
     console.print(result_table(result))
     written = [f"wrote {path}" for path in files]
     for line in (summed_up(fit), *remarks(result), *written):

@@ -21,7 +21,7 @@ from elastic_env.joint.model_file import read_model
 from elastic_env.joint.supported_models import held_positions
 from elastic_env.rigid.tree.end_effector import site_or_body
 from elastic_env.rigid.tree.links import Tree
-from train.commands.held_out import judge_poses, number_or_dash, show_held_out
+from train.commands.held_out import judge_poses, number_or_dash, print_held_out
 from train.commands.identify_options import ArmOptions, GeometryOptions, IdentificationRun
 from train.figures.identification_plots import draw_geometry
 from train.runs.console import make_table
@@ -112,7 +112,7 @@ def _axial(log: PoseLog) -> AxialTorques | None:
 def show_result(result: GeometryIdentification, console: Console) -> None:
     """Print held-out errors, stiffness, and what the poses do not tell."""
     if result.held_out is not None:
-        show_held_out(result.held_out, console)
+        print_held_out(result.held_out, console)
     rows = []
     friction = {one.name: one for one in result.parameters if one.kind == "friction"}
     for joint in result.joints:
