@@ -124,9 +124,8 @@ class _BatchRun:
     def __post_init__(self) -> None:
         conditions = self.conditions
         steps = rollout.num_steps(conditions)
-        cores = len(conditions)
-        if self.place.is_local:
-            cores = self.place.jobs or os.cpu_count() or 1
+        local_cores = self.place.jobs or os.cpu_count() or 1
+        cores = local_cores if self.place.is_local else len(conditions)
 
         def length(batch: list[int]) -> int:
             return sum(steps[i] for i in batch)
@@ -206,8 +205,7 @@ def make_batches(conditions: Sequence[Condition], cores: int) -> list[list[int]]
             batches.append([number])
             continue
         policy = (condition.policy, condition.member, condition.policy_options)
-        settings = rollout.shared_settings(condition)
-        key = repr((policy, condition.reference_name, settings))
+        key = repr((policy, condition.reference_name, rollout.shared_settings(condition)))
         batch, size = open_batch.get(key, ([], max_size))
         if size + condition.episodes > max_size:
             batch = []

@@ -113,8 +113,7 @@ def _parse(arguments: list[str]) -> Any:
     from train.commands.options import name_options
 
     name = arguments[0]
-    module = importlib.import_module(f"train.commands.{name}")
-    options = getattr(module, name.capitalize())
+    options = getattr(importlib.import_module(f"train.commands.{name}"), name.capitalize())
 
     def command(values: Any) -> Any:
         return values
@@ -148,8 +147,7 @@ def _parse_overview(arguments: list[str]) -> Any:
         kind = dataclasses.make_dataclass(name, [], namespace={"__doc__": _help_of(name)})
         members.append(Annotated[kind, tyro.conf.subcommand(name)])
     union = functools.reduce(operator.or_, members)
-    cli = functools.partial(tyro.cli, description=_OVERVIEW, config=_STYLE)
-    return cli(union, prog="elastic", args=arguments)
+    return tyro.cli(union, prog="elastic", description=_OVERVIEW, args=arguments, config=_STYLE)
 
 
 _OVERVIEW = (

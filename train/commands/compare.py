@@ -102,8 +102,8 @@ class Compare(Model):
         if self.hardware.arguments:
             real = self.hardware.environment(config.env)
             real["env_options"] = {**config.env_options, **real["env_options"]}
-            simulated = {"scenario_episodes": {}, "groups": {}}
-            config = config.replace(scenarios=["hardware"], **simulated, **real)
+            real |= {"scenarios": ["hardware"], "scenario_episodes": {}, "groups": {}}
+            config = config.replace(**real)
         finished = compare(
             config,
             console,

@@ -130,8 +130,7 @@ class CompareConfig(CodeNamingModel):
         scenarios = [make_scenario(name, walks, self.ranges) for name in self.scenarios]
         protocol["scenarios"] = [scenario.model_dump(mode="json") for scenario in scenarios]
         digest = hashlib.sha256(json.dumps(protocol, sort_keys=True).encode()).hexdigest()[:16]
-        packages = ("elastic-env", "mujoco")
-        versions = [f"{name} {installed_version(name)}" for name in packages]
+        versions = [f"{name} {installed_version(name)}" for name in ("elastic-env", "mujoco")]
         return "; ".join([*versions, f"protocol {digest}"])
 
     @property

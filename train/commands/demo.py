@@ -15,18 +15,16 @@ from elastic_env.core.config import Model
 from train.cells.play import run_conditions
 from train.commands.compare_config import CompareConfig
 from train.evaluate.conditions import PolicySpec
-from train.evaluate.episodes import Evaluation, group_by
+from train.evaluate.episodes import Evaluation
 from train.evaluate.rollout import make_vector_env
 from train.figures import comparison_figures, plots
-from train.figures.chart import time_chart
 from train.figures.colours import policy_colours
 from train.figures.identification_plots import draw_identification
 from train.report import summary
 from train.report.page import TEXTS, Page
 from train.report.report_text import capital
-from train.report.specs import page_chart
 from train.report.tables import Table
-from train.report.write import require_libraries, write_page
+from train.report.write import add_time_chart, require_libraries, write_page
 from train.runs.console import make_table, print_files
 from train.runs.folders import run_folder
 
@@ -109,9 +107,8 @@ class Demo(Model):
             for walk in comparison_figures.cells_together(walks):
                 files += comparison_figures.draw_signals(walk, folder, self.figure_format)
             testbed_rows = _testbed_rows(result, static)
-            page = _report(testbed_rows, files[:2], motion, walks)
             files += [
-                *write_page(page, folder),
+                *write_page(_report(testbed_rows, files[:2], motion, walks), folder),
                 folder / "identification.json",
                 summary.write_episodes(scored, folder / "episodes.csv"),
                 summary.write_summary(scored, folder / "summary.md"),
@@ -151,16 +148,11 @@ def _report(testbed_rows: Rows, pictures: Sequence[Path], motion: Cells, walks: 
 
 def _add_cells(page: Page, evaluations: Cells) -> None:
     """Add the scores of some cells, and a chart for each motion and scenario."""
-    environment = evaluations[0].condition.environment
-    page.add("table", summary.summary_table(evaluations, environment.columns))
+    columns = evaluations[0].condition.environment.columns
+    page.add("table", summary.summary_table(evaluations, columns))
     for cells in comparison_figures.cells_together(evaluations):
-        first = cells[0].condition
-        policies = group_by(cells, lambda e: e.condition.policy.title)
-        chart = time_chart(
-            policies, environment.curves, policy_colours(list(policies)), _MAX_POINTS
-        )
-        title = capital(f"{environment.title(first.reference_name)}, {first.scenario}")
-        page.add("chart", page_chart(chart), title)
+        policies = dict.fromkeys(cell.condition.policy.title for cell in cells)
+        add_time_chart(page, cells, policy_colours(list(policies)), _MAX_POINTS)
 
 
 _MAX_POINTS = 1500

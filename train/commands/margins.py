@@ -85,8 +85,9 @@ class Margins(Model):
         ]
         try_out(conditions)
         steps = num_steps(conditions)
-        rounds = self.halvings + 1
-        totals = {name: rounds * count for name, count in zip(self.policies, steps, strict=True)}
+        totals = {
+            name: (self.halvings + 1) * n for name, n in zip(self.policies, steps, strict=True)
+        }
         recorded = self.model_dump(mode="json", exclude={"output", "threads"})
         records: list[dict[str, Any]] = []
         with run_folder("margins", recorded, self.seed, self.output) as folder:

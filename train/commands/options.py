@@ -86,7 +86,7 @@ class OnHardware(Model):
     yes: bool = False
     """Begin to move without asking."""
     patient: bool = False
-    """Tolerate ten missing replies in a row, 90 ms without a command and attitudes 0.2 s old. Meant for
+    """Tolerate ten missing replies in a row, 90 ms without a command and attitudes 0.2 s old: for
     emulators, whose pseudo-terminals stall while the computer is busy."""
 
     @cached_property

@@ -71,8 +71,7 @@ def steps_within(task: Any, max_s: float | None) -> int:
     """
     if max_s is None:
         return task.num_steps
-    steps = max_s / task.assumed_model.control_period_s
-    return max(round(min(steps, task.num_steps)), 1)
+    return max(round(min(max_s / task.assumed_model.control_period_s, task.num_steps)), 1)
 
 
 def _rehearse(policy: Any, condition: Condition, console: Console) -> None:

@@ -76,8 +76,12 @@ def _dot_plot(
         }
         data.append(texts)
         domain = specs.domain(number, len(panels), gap=0.03)
-        place = {"domain": domain, "anchor": "y", "side": "top"}
-        layout[f"xaxis{specs.nth(number)}"] = {**axis, **place}
+        layout[f"xaxis{specs.nth(number)}"] = {
+            **axis,
+            "domain": domain,
+            "anchor": "y",
+            "side": "top",
+        }
     layout["yaxis"] = base_axis(
         range=[max(rows, default=0.0) + 0.7, -0.7],
         tickvals=list(rows),
@@ -145,10 +149,9 @@ def ladder(table: EpisodeTable, reference: str, colours: Mapping[str, str]) -> S
     )
     layout = chart["layout"]
     layout["annotations"] = [_heading(*heading) for heading in headings.items()]
-    line = {"color": LINE, "width": 1}
-    rule = {"type": "line", "xref": "paper", "x0": 0, "x1": 1}
+    rule = {"type": "line", "xref": "paper", "x0": 0, "x1": 1, "line": {"color": LINE, "width": 1}}
     places = [place - 0.6 for place in list(headings.values())[1:]]
-    layout["shapes"] = [{**rule, "y0": y, "y1": y, "line": line} for y in places]
+    layout["shapes"] = [{**rule, "y0": y, "y1": y} for y in places]
     return chart
 
 

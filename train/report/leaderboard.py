@@ -110,8 +110,7 @@ def _entry(
     for s in standings:
         score = s.score.times(_column(s).scale)
         look = "bold" if best[s.scope, s.reference, s.metric] == s.policy else ""
-        before = " / " if parts else ""
-        parts.append(Part(three_digits(score.value), look, before))
+        parts.append(Part(three_digits(score.value), look, " / " if parts else ""))
         if score.has_interval:
             low, high = map(three_digits, score.ends)
             intervals.append(Part(f"[{low}, {high}]", "small"))

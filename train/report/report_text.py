@@ -140,8 +140,7 @@ def sentences(kind: Literal["headline", "in_short", "notes"], results: Results) 
         "verdict_words": _VERDICTS,
     }
     text = getattr(load_template("sentences.j2").make_module(helpers), kind)(results)
-    parts = [re.sub(r"[ \n]+", " ", part).strip() for part in text.split("\n\n")]
-    return list(filter(None, parts))
+    return list(filter(None, [re.sub(r"[ \n]+", " ", part).strip() for part in text.split("\n\n")]))
 
 
 def _rank_policies(table: EpisodeTable) -> list[dict[str, Any]]:

@@ -51,8 +51,7 @@ def summary_table(
     environment = evaluations[0].condition.environment
     swept = list(dict.fromkeys(name for e in evaluations for name in e.condition.swept))
     judged = {column.metric for column in environment.judged}
-    names = ("reference", "scenario", "policy")
-    heads = [Head(name, is_number=False) for name in names]
+    heads = [Head(name, is_number=False) for name in ("reference", "scenario", "policy")]
     heads += [Head(name) for name in swept]
     for column in columns:
         leaves = 2 if column.metric in judged else 1
@@ -64,8 +63,7 @@ def summary_table(
         names = [condition.reference_name, condition.scenario, condition.policy.title]
         values = condition.swept_values(swept)
         figures = [_figure(e, column, worst, intervals) for column in columns]
-        failed = f"{e.num_failed}/{len(e.episodes)}"
-        rows.append(Row((*names, *values, *figures, failed)))
+        rows.append(Row((*names, *values, *figures, f"{e.num_failed}/{len(e.episodes)}")))
     title = f"{environment.subject}, median over episodes"
     title += _interval_label(evaluations) if intervals else ""
     return Table(tuple(heads), tuple(rows), keys=3, title=title, caption=environment.note)

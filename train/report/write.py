@@ -1,6 +1,6 @@
 """The report of a comparison: `report.html`, which works offline, and `report.md`."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from elastic_env.core.errors import missing_extra
@@ -97,8 +97,7 @@ def _page(results: Results) -> Page:
     if results.learning:
         columns = results.environment.judged
         page.section("Learning curves", TEXTS["learning"])
-        chart = learning_chart(results.learning, columns, results.colours)
-        page.add("chart", page_chart(chart))
+        page.add("chart", page_chart(learning_chart(results.learning, columns, results.colours)))
         table = learning_table(results.learning, columns)
         page.add("table", table, "Table of learning curves", is_folded=True)
     page.section("Notes")
@@ -161,18 +160,29 @@ def _add_table(page: Page, table: Table, title: str = "Table") -> None:
 def _add_curves(page: Page, results: Results) -> None:
     """Add the signals of first episodes over time: a chart for each motion and scenario."""
     table = results.table
-    environment = table.environment
-    walk = TEXTS["curves_walk"] if environment.walks else ""
+    walk = TEXTS["curves_walk"] if table.environment.walks else ""
     page.section("Curves over time", f"{_text(results, 'curves')}{walk}")
     traced = [e for e in results.evaluations if e.trace]
     share = _TOTAL_POINTS // (len(table.references) * len(table.scenarios))
     points = min(_MAX_POINTS, max(_MIN_POINTS, share))
-    for number, evaluations in enumerate(cells_together(traced)):
-        first = evaluations[0].condition
-        policies = group_by(evaluations, lambda e: e.condition.policy.title)
-        chart = time_chart(policies, environment.curves, results.colours, points)
-        title = capital(f"{environment.title(first.reference_name)}, {first.scenario}")
-        page.add("chart", page_chart(chart), title, is_folded=True, is_open=number == 0)
+    for number, cells in enumerate(cells_together(traced)):
+        add_time_chart(page, cells, results.colours, points, is_folded=True, is_open=number == 0)
+
+
+def add_time_chart(
+    page: Page,
+    cells: Sequence[Evaluation],
+    colours: Mapping[str, str],
+    points: int,
+    **folding: bool,
+) -> None:
+    """Add the signals of all policies in one motion and scenario, with at most so many points."""
+    condition = cells[0].condition
+    environment = condition.environment
+    policies = group_by(cells, lambda e: e.condition.policy.title)
+    chart = time_chart(policies, environment.curves, colours, points)
+    title = capital(f"{environment.title(condition.reference_name)}, {condition.scenario}")
+    page.add("chart", page_chart(chart), title, **folding)
 
 
 def _add_sweeps(page: Page, results: Results) -> None:

@@ -57,10 +57,9 @@ def can_redraw(console: Console) -> bool:
     return console.is_terminal and console.file.isatty()
 
 
-_Row = Sequence[str]
-
-
-def make_table(title: str, head: _Row, rows: Iterable[_Row], left: int = 1, **style: Any) -> Table:
+def make_table(
+    title: str, head: Sequence[str], rows: Iterable[Sequence[str]], left: int = 1, **style: Any
+) -> Table:
     """Return a table of plain texts.
 
     Args:
