@@ -101,11 +101,8 @@ class Speed(Model):
 
     def run(self, console: Console) -> None:
         """Measure, print the figures, and write them."""
-        if self.real_time:
-            path = measure_real_time(self, console)
-        else:
-            path = measure_throughput(self, console)
-        console.print(f"wrote {path}")
+        work = measure_real_time if self.real_time else measure_throughput
+        console.print(f"wrote {work(self, console)}")
 
 
 _TIMES = {"latency": "from due to command", "policy": "in the policy"}

@@ -192,9 +192,7 @@ def forest(rows: Sequence[Change]) -> Spec:
     """Return the chart of changes of one residual against its base, in all cells."""
     lines = by_line(rows)
     several = len({row.reference for row in rows}) > 1
-    names = []
-    for row, *_ in lines:
-        names.append(f"{row.reference} · {row.scope}" if several else row.scope)
+    names = [f"{row.reference} · {row.scope}" if several else row.scope for row, *_ in lines]
     panels = []
     for column, metric_rows in group_by(rows, lambda row: row.column).items():
         changes = [row.relative.times(100.0) for row in metric_rows]

@@ -275,18 +275,18 @@ def _standing(row: Mapping[str, str]) -> Standing:
     return _STANDING.validate_python(fields)
 
 
-def _estimate(value: str, low: str, high: str) -> Estimate:
+def _parse_estimate(value: str, low: str, high: str) -> Estimate:
     if not low:
         return Estimate(float(value))
     return Estimate(float(value), float(low), float(high))
 
 
-def _paired(to: str, value: str, low: str, high: str, verdict: str) -> Paired | None:
-    return Paired(to, _estimate(value, low, high), verdict) if to else None
+def _parse_paired(to: str, value: str, low: str, high: str, verdict: str) -> Paired | None:
+    return Paired(to, _parse_estimate(value, low, high), verdict) if to else None
 
 
 _NEW_FIELDS = ("interval_over", "origin", "is_published")
 """Fields that older leaderboards lack."""
-_PARSERS: Mapping[int, Callable[..., Any]] = {1: str, 3: _estimate, 5: _paired}
+_PARSERS: Mapping[int, Callable[..., Any]] = {1: str, 3: _parse_estimate, 5: _parse_paired}
 """Functions that make a field from its cells, by the number of cells."""
 _STANDING = TypeAdapter(Standing)

@@ -70,8 +70,7 @@ def write_page(page: Page, folder: Path) -> list[Path]:
 
 
 def _page(results: Results) -> Page:
-    subject = capital(results.environment.subject)
-    under = f"{subject}; made {results.metadata['created'][:10]}"
+    under = f"{capital(results.environment.subject)}; made {results.metadata['created'][:10]}"
     page = Page(f"Comparison: {results.name}", under)
     page.section("What was compared", *sentences("headline", results))
     page.add("definitions", facts(results))
