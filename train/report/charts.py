@@ -149,9 +149,10 @@ def ladder(table: EpisodeTable, reference: str, colours: Mapping[str, str]) -> S
     )
     layout = chart["layout"]
     layout["annotations"] = [_heading(*heading) for heading in headings.items()]
-    rule = {"type": "line", "xref": "paper", "x0": 0, "x1": 1, "line": {"color": LINE, "width": 1}}
+    line = {"color": LINE, "width": 1}
+    rule = {"type": "line", "xref": "paper", "x0": 0, "x1": 1}
     places = [place - 0.6 for place in list(headings.values())[1:]]
-    layout["shapes"] = [{**rule, "y0": y, "y1": y} for y in places]
+    layout["shapes"] = [{**rule, "y0": y, "y1": y, "line": line} for y in places]
     return chart
 
 
