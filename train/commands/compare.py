@@ -20,16 +20,17 @@ from train.workers.executors import Executors
 
 
 class Compare(Model):
-    """Compare policies × scenarios × references × seeds as a configuration says.
+    """Compare policies × scenarios × references × seeds of a configuration.
 
     Writes episodes.csv (one row per episode), statistics.csv (paired changes), report.html (charts
-    and tables, works offline), report.md, summary.md and figures beside the resolved configuration,
+    and tables, works offline), report.md, summary.md and figures, with the resolved configuration,
     seed, versions and commit.
 
     A policy residual:PATH may have a * in its path, such as residual:runs/NAME/seed_*/last: all
     training seeds of a residual, compared with their base on the same episodes. The base is added
-    if it is not among the policies. residual:walker_3s/seed_* and the like are the trained ones of
-    the package. Intervals are over training seeds, and over the robots of scenarios that draw them.
+    if it is not among the policies. The package has trained residuals, such as
+    residual:walker_3s/seed_*. Intervals are over training seeds, and over the robots of scenarios
+    that draw them.
 
     Example, one joint: elastic compare testbed
 
@@ -37,10 +38,10 @@ class Compare(Model):
 
     Example, trained residuals: elastic compare learned_testbed
 
-    Example, all policies in tracks by what they need: elastic compare leaderboard
+    Example, all policies in tracks by their needs: elastic compare leaderboard
 
-    Example, your policy beside them, which are not played again: elastic compare leaderboard
-        --policies mine.py:make --published leaderboard
+    Example, your policy next to published rows, which are not played again: elastic compare
+        leaderboard --policies mine.py:make --published leaderboard
 
     Example, heat maps over two axes: elastic compare map_payload_slope
     """
@@ -54,15 +55,15 @@ class Compare(Model):
     output: Path | None = None
     """Folder for the results, new or empty; default runs/<name>, numbered if taken."""
     episodes: int | None = None
-    """Episodes per cell, in place of what the configuration says: 1 for a first look."""
+    """Episodes per cell, instead of the configuration's own: 1 for a first look."""
     policies: tuple[Locator, ...] = ()
-    """Policies in place of those of the configuration: baselines, or FILE.py:function."""
+    """Policies instead of the configuration's own: baselines, or FILE.py:function."""
     published: Path | None = None
-    """leaderboard.csv whose rows yours are appended to, and which are not played; `leaderboard` is
-    the one of the package. It must be of the same version and protocol.
+    """leaderboard.csv to which your rows are appended, and which is not played again; `leaderboard`
+    is the one of the package. Version and protocol must be the same.
     """
     resume: Path | None = None
-    """Folder of a run to go on with: what is missing or has changed is played."""
+    """Folder of a run to continue: missing and changed cells are played."""
     figure_format: FigureFormat = "png"
     """Of the figures: pdf and svg have no resolution, and png has 300 dpi."""
     fresh: bool = False

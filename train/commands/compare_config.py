@@ -73,7 +73,7 @@ class CompareConfig(CodeNamingModel):
     seed: Seed = 0
     """Seed of the first episode."""
     ranges: GivenRanges = {}
-    """Intervals that the robots of the scenario `drawn` are drawn from, in place of its own."""
+    """Intervals from which the robots of the scenario `drawn` are drawn, instead of its own."""
     env_options: EnvOptions = {}
     """Further arguments of the environment, such as stiffness."""
     figure_policies: list[str] = []
@@ -155,7 +155,7 @@ class CompareConfig(CodeNamingModel):
         for name, scenarios in self.reference_scenarios.items():
             require_known(f"scenario of {name!r}", scenarios, known)
         if duplicates := _duplicates(references):
-            yield f"the reference {quote(duplicates[0])} stands twice; leave out one of them"
+            yield f"the reference {quote(duplicates[0])} is listed twice; leave out one of them"
         for name, scenarios in self.groups.items():
             require_known(f"scenario of the group {name!r}", scenarios, known)
             if name in known:

@@ -83,7 +83,7 @@ class Demo(Model):
         require_libraries()
         parts = [config.conditions() for config in _PARTS]
         conditions = list(chain(*parts))
-        recorded = {"conditions": [own.model_dump(mode="json") for own in conditions]}
+        recorded = {"conditions": [cell.model_dump(mode="json") for cell in conditions]}
         with run_folder("demo", recorded, 0, self.output) as folder:
             console.print(_INTRODUCTION)
             evaluations = iter(run_conditions(conditions, console))

@@ -134,7 +134,7 @@ def _parts(evaluations: Sequence[Evaluation]) -> list[str]:
     worst = f"{interval} (the worst of them)" if interval else ""
     statistic = f"Median over the episodes that did not fail{worst}"
     parts = [
-        f"{capital(environment.subject)}. {statistic}; failures are counted beside.",
+        f"{capital(environment.subject)}. {statistic}; failures are counted separately.",
         " ".join([*column_notes(environment.columns), *filter(None, [environment.note])]),
         to_markdown(summary_table(evaluations, environment.columns, worst=True)),
     ]

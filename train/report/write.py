@@ -57,7 +57,7 @@ def require_plotly() -> str:
 
 
 def write_report(results: Results) -> list[Path]:
-    """Write `report.html` and `report.md` beside the other files of a comparison."""
+    """Write `report.html` and `report.md` into the folder of a comparison."""
     return write_page(_page(results), results.folder)
 
 

@@ -34,8 +34,7 @@ def plain_progress(
     The remaining time of long work is printed early. A line with a note also has the remaining
     time.
 
-    It serves logs, and work beside a control loop or under a stopwatch, which the thread of a bar
-    would delay.
+    It serves logs, control loops and timed work; the thread of a bar would delay the last two.
 
     Args:
         console: Console for the lines.

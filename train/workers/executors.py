@@ -23,7 +23,7 @@ class Executors(Model):
     jobs: int = quantity("1", 0, ge=0, le=1024)
     """Cells, or training seeds, at a time on this machine, 0 for one per core; several share the
     cores, and all of them end sooner than one by one. On hardware cells come one after the other; a
-    cluster says itself how many."""
+    cluster decides itself."""
     on: str = Field(default=_LOCAL, pattern=_NAMES)
     """Executors: local, dask://HOST:PORT of a scheduler, slurm, or slurm:FILE.yaml with what a job
     asks for; see docs/cluster.md."""
