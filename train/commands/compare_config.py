@@ -155,7 +155,7 @@ class CompareConfig(CodeNamingModel):
         for name, scenarios in self.reference_scenarios.items():
             require_known(f"scenario of {name!r}", scenarios, known)
         if duplicates := _duplicates(references):
-            yield f"the reference {quote(duplicates[0])} is listed twice; leave out one of them"
+            yield f"the reference {quote(duplicates[0])} stands twice; leave out one of them"
         for name, scenarios in self.groups.items():
             require_known(f"scenario of the group {name!r}", scenarios, known)
             if name in known:
