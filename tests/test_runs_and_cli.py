@@ -29,7 +29,7 @@ import train.commands.demo
 import train.commands.speed
 import train.evaluate.episodes
 import train.report.summary
-import train.speed.ppo_loop
+import train.speed.foreign_loops
 from baselines.catalogue import ON_JOINTS, ON_THE_WALKER
 from baselines.identification.identify import Identification
 from elastic_env.core.config import load_yaml
@@ -922,7 +922,7 @@ def test_speed_of_learning_end_to_end(policy: str, monkeypatch: pytest.MonkeyPat
     policy of the user's."""
     own = "import baselines\n\n\ndef make(env):\n    return baselines.make('zero', env)\n"
     Path("mine.py").write_text(own)
-    monkeypatch.setattr(train.speed.ppo_loop, "PPO_DECISIONS", 32)
+    monkeypatch.setattr(train.speed.foreign_loops, "PPO_DECISIONS", 32)
     main([*SPEED, "--env", "testbed", "--num-envs", "2", "--no-others", "--policy", policy])
     ours, processes = json.loads(Path("runs/speed/speed.json").read_text())[-2:]
     assert (ours["contender"], ours["num_envs"]) == (f"PPO with {policy}, vector env", 64)

@@ -99,26 +99,21 @@ def compare(
 
 def _results(
     config: CompareConfig,
-    evaluations: list[Evaluation],
+    cells: list[Evaluation],
     folder: Path,
     board: Sequence[Standing],
     report: bool,
 ) -> Results:
     """Return the results of finished cells; changes only for a report."""
-    maps = [] if config.map is None else heat_maps(evaluations, config.map)
-    rows = changes(evaluations, config.groups) if report else []
+    axis = config.sweep and config.sweep.title
+    maps = [] if config.map is None else heat_maps(cells, config.map)
+    rows = changes(cells, config.groups) if report else []
     # a leaderboard or a map finds the best policy of each column or cell itself
     if config.leaderboard or maps:
         rows = [row for row in rows if not row.is_rival]
+    robots = robot_scores(cells)
     return Results(
-        config.name,
-        evaluations,
-        changes=rows,
-        folder=folder,
-        swept=config.sweep and config.sweep.title,
-        maps=maps,
-        standings=board,
-        robots=robot_scores(evaluations),
+        config.name, cells, rows, folder, swept=axis, maps=maps, standings=board, robots=robots
     )
 
 

@@ -21,8 +21,7 @@ from train.runs.escaping import write_records
 from train.runs.folders import run_folder
 from train.runs.progress import plain_progress
 from train.speed.contenders import Contender, RawWorlds, ScalarLoop, VectorLoop
-from train.speed.foreign_loops import IN_PROCESSES, IN_THIS_PROCESS, ForeignLoop
-from train.speed.ppo_loop import PPOLoop
+from train.speed.foreign_loops import IN_PROCESSES, IN_THIS_PROCESS, ForeignLoop, PPOLoop
 from train.speed.real_time import PERCENTILES, play_against_the_clock
 
 _PPO_PROCESSES = 2

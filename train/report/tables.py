@@ -8,8 +8,7 @@ from train.evaluate.changes import Verdict
 from train.evaluate.environments import Column
 from train.evaluate.statistics import Estimate
 
-Look = Literal["", "bold", "small", "failure", "badge", "pooled", "ceiling"]
-Style = Look | Verdict
+Style = Literal["", "bold", "small", "failure", "badge", "pooled", "ceiling"] | Verdict
 
 
 @dataclass(frozen=True)

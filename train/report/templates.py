@@ -1,18 +1,15 @@
 """Templates of Jinja2: the page of a report as HTML, and its sentences as plain text."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 from elastic_env.core.errors import missing_extra
 from train.figures.colours import NIGHT, VERDICTS
 from train.report.specs import FONT
 from train.runs.escaping import line_value, script_json, template_value
 
-if TYPE_CHECKING:
-    from jinja2 import Template
 
-
-def load_template(name: str = "page.html.j2") -> "Template":
+def load_template(name: str = "page.html.j2") -> Any:
     """Load a template, by default that of a page; HTML templates escape all values.
 
     Raises:

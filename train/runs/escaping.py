@@ -88,9 +88,8 @@ def _visible_data(value: Any) -> Any:
         return visible(value)
     if isinstance(value, dict):
         return {key: _visible_data(part) for key, part in value.items()}
-    if isinstance(value, list | tuple):
-        return [_visible_data(part) for part in value]
-    return value
+    is_list = isinstance(value, list | tuple)
+    return [_visible_data(part) for part in value] if is_list else value
 
 
 def template_value(value: Any) -> Any:

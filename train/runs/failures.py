@@ -90,8 +90,7 @@ def is_closed_pipe(error: BaseException) -> bool:
 
 def is_disk_full(error: BaseException) -> bool:
     """Return true if an error comes from a full disk, a quota or a limit on the size of files."""
-    causes = [cause for cause in _causes(error) if isinstance(cause, OSError)]
-    return any(cause.errno in _FULL_DISK_ERRORS for cause in causes)
+    return any(isinstance(e, OSError) and e.errno in _FULL_DISK_ERRORS for e in _causes(error))
 
 
 def _extra_of(error: ModuleNotFoundError) -> str:

@@ -1,6 +1,5 @@
 """Result folders: never overwritten, each with configuration, seed, versions and commit."""
 
-import contextlib
 import errno
 import fcntl
 import itertools
@@ -11,7 +10,7 @@ import stat
 import subprocess
 import time
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
@@ -155,7 +154,7 @@ def lock_run(folder: Path, patience_s: float = 0.0) -> Iterator[None]:
     with _open_lock(folder / _LOCK) as file:
         deadline = time.monotonic() + patience_s
         while True:
-            with contextlib.suppress(BlockingIOError):
+            with suppress(BlockingIOError):
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 break
             if time.monotonic() >= deadline:
@@ -234,7 +233,7 @@ def _remove_without_result(folder: Path) -> Iterator[None]:
                 file.unlink()
             folder.rmdir()
             if folder.parent == RUNS:
-                with contextlib.suppress(OSError):  # it contains other runs
+                with suppress(OSError):  # it contains other runs
                     RUNS.rmdir()
         raise
 
@@ -244,7 +243,7 @@ def _numbered_folder(name: str) -> Path:
     RUNS.mkdir(parents=True, exist_ok=True)
     for number in itertools.count(1):
         folder = RUNS / (name if number == 1 else f"{name}-{number}")
-        with contextlib.suppress(FileExistsError):
+        with suppress(FileExistsError):
             folder.mkdir()
             return folder
     raise AssertionError

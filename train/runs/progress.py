@@ -1,10 +1,9 @@
 """Progress of long work: bars on a terminal, a line from time to time in a log."""
 
-import contextlib
 import logging
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 
 from rich import progress
 from rich.console import Console
@@ -129,7 +128,7 @@ def announce_compilation(console: Console) -> Iterator[None]:
         if not is_announced:
             is_announced = True
             # a closed console must not stop the compilation
-            with contextlib.suppress(OSError):
+            with suppress(OSError):
                 console.print(record.getMessage(), soft_wrap=True)
         return True
 

@@ -41,11 +41,9 @@ def require_same(ours: _Versions, theirs: _Versions, where: str) -> None:
     Raises:
         VersionsDifferError: The versions differ; the message lists both.
     """
-    differences = [
-        f"{name} {theirs.get(name)} there, {ours.get(name)} here"
-        for name in dict.fromkeys([*ours, *theirs])
-        if ours.get(name) != theirs.get(name)
-    ]
+    names = dict.fromkeys([*ours, *theirs])
+    differing = [name for name in names if ours.get(name) != theirs.get(name)]
+    differences = [f"{name} {theirs.get(name)} there, {ours.get(name)} here" for name in differing]
     if differences:
         raise VersionsDifferError(
             f"all machines must have the same versions, but on {where} they differ:"
