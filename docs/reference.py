@@ -31,7 +31,7 @@ from elastic_env.hardware.settings import SafetyLimits
 from elastic_env.world.scenario import DISTRIBUTIONS, RANGES_BEYOND, TRAINING_RANGES, scenario_names
 from train.commands.bench import BenchCase, BenchConfig
 from train.commands.cli import COMMANDS, main
-from train.commands.compare import CompareConfig
+from train.commands.compare_config import CompareConfig
 from train.commands.options import Mounting
 from train.evaluate.conditions import PolicySpec
 from train.learn.algorithm_options import MODELS

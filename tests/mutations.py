@@ -24,7 +24,8 @@ from elastic_env.core.config import load_yaml
 from elastic_env.core.errors import ElasticError
 from elastic_env.core.yaml_text import parse_yaml
 from train.commands.bench import BenchConfig
-from train.commands.compare import CompareConfig, try_out
+from train.commands.compare_config import CompareConfig
+from train.commands.comparison import try_out
 from train.evaluate.conditions import PolicySpec
 from train.evaluate.residual_seeds import expand, origin
 from train.learn.train_config import TrainConfig, training_worlds

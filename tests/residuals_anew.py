@@ -18,7 +18,8 @@ from rich.console import Console
 from elastic_env.core.config import load_yaml
 from elastic_env.core.errors import ConfigurationError, require_known
 from train.commands.cli import CONSOLE, run_program
-from train.commands.compare import CompareConfig, Comparison, compare
+from train.commands.compare_config import CompareConfig
+from train.commands.comparison import Comparison, compare
 from train.commands.entry import start as start_program
 from train.evaluate.conditions import PolicySpec
 from train.learn.run_training import resume, start

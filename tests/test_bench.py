@@ -10,7 +10,7 @@ import yaml
 
 from elastic_env.core.config import load_yaml
 from elastic_env.core.errors import ConfigurationError
-from train.commands.bench import BenchConfig, configuration
+from train.commands.bench import BenchConfig, find_config
 from train.commands.cli import main
 from train.evaluate.conditions import Condition
 from train.evaluate.episodes import evaluate
@@ -29,7 +29,7 @@ def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def written(**case: Any) -> Path:
-    """A configuration of one rollout."""
+    """A find_config of one rollout."""
     path = Path("bench.yaml")
     content = {
         "env": "testbed",
@@ -168,7 +168,7 @@ def test_wrong_inputs_are_annotations_too(
     with pytest.raises(SystemExit) as end:
         main(["bench", "none.yaml"])
     assert end.value.code == 2
-    assert "::error title=elastic::no configuration file at none.yaml" in capsys.readouterr().out
+    assert "::error title=elastic::no find_config file at none.yaml" in capsys.readouterr().out
 
 
 def test_an_annotation_is_one_command_whatever_it_says() -> None:
@@ -250,12 +250,12 @@ def test_the_shipped_configuration_is_accepted_in_full() -> None:
 def test_the_package_has_its_own_configuration(monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches a bench that works in a checkout alone, and one that would change the installed
     package."""
-    shipped = configuration(Path("configs/bench.yaml"))
+    shipped = find_config(Path("configs/bench.yaml"))
     assert load_yaml(shipped, BenchConfig).cases
     assert shipped.resolve() == (ROOT / "configs" / "bench.yaml").resolve()
     with pytest.raises(ConfigurationError, match=r"copy .* there first"):
-        configuration(Path("configs/bench.yaml"), update=True)
-    assert configuration(Path("mine.yaml")) == Path("mine.yaml")
+        find_config(Path("configs/bench.yaml"), update=True)
+    assert find_config(Path("mine.yaml")) == Path("mine.yaml")
 
 
 @pytest.mark.parametrize("field", ["policy", "env"])

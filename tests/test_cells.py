@@ -13,8 +13,10 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from train.cells.play import CellsFailedError, in_batches, run_conditions
-from train.cells.store import Store, UnfitCellError, _digest, cell_key
+from train.cells.cell_file import UnfitCellError, _digest
+from train.cells.cell_key import cell_key
+from train.cells.play import CellsFailedError, make_batches, run_conditions
+from train.cells.store import Store
 from train.evaluate.conditions import Condition, Member, PolicySpec
 from train.evaluate.episodes import Evaluation, evaluate
 from train.workers.executors import Executors
@@ -234,7 +236,7 @@ def test_a_robot_that_does_not_stand_ends_its_own_cell_alone() -> None:
         )
         for slope in (0.0, 0.12, 0.01)
     ]
-    assert in_batches(conditions * 2, cores=1) == [[0, 1, 2], [3, 4, 5]]
+    assert make_batches(conditions * 2, cores=1) == [[0, 1, 2], [3, 4, 5]]
     place = Executors(jobs=1)
     with pytest.raises(CellsFailedError, match=r"slope_rad=0\.12: .*does not stand") as failure:
         run_conditions(conditions * 2, Console(quiet=True), place)

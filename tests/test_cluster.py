@@ -21,17 +21,19 @@ from elastic_env.core.errors import ConfigurationError, SystemFailedError
 from elastic_env.core.files import flush
 from tests.cluster_trials import SINE, dask_cluster, free_port
 from tests.test_training import PPO, SMALL, weights
+from train.cells.cell_key import cell_key
 from train.cells.play import run_conditions
-from train.cells.store import Store, cell_key
+from train.cells.store import Store
 from train.commands.cli import main
 from train.evaluate.conditions import Condition, PolicySpec
 from train.evaluate.episodes import Evaluation, evaluate, evaluate_together
 from train.learn.run_training import start
 from train.learn.train_config import TrainConfig
 from train.learn.training import Training
-from train.workers.calls import Watch, WorkerKilledError, run_calls
+from train.workers.calls import Watch, run_calls
 from train.workers.dask_cluster import warn_of_public
 from train.workers.executors import Executors
+from train.workers.pool import WorkerKilledError
 from train.workers.versions import VersionsDifferError, require_same
 
 CONDITIONS = [
@@ -81,7 +83,7 @@ def test_a_call_that_kills_its_process_each_time_fails_alone(tmp_path: Path) -> 
     moved: list[int] = []
     with Executors(jobs=2).open_pool(3, tmp_path) as pool:
         outcomes = run_calls(
-            always_killed, [(False,), (True,), (False,)], pool, Watch(moved=moved.append)
+            always_killed, [(False,), (True,), (False,)], pool, Watch(on_move=moved.append)
         )
     assert moved == [1, 1]
     assert [outcome.value for outcome in outcomes if outcome is not None] == ["fine", None, "fine"]
@@ -141,7 +143,7 @@ def test_a_comparison_on_this_machine_needs_no_process_but_its_workers(tmp_path:
     is killed."""
     known = processes_of(os.getpid())
     reports = list[Any]()
-    watch = Watch(reported=lambda number, value: reports.append((number, value)))
+    watch = Watch(on_report=lambda number, value: reports.append((number, value)))
     with Executors(jobs=1).open_pool(2, tmp_path) as pool:
         outcomes = run_calls(helpers_killed, [(known,)] * 2, pool, watch)
     assert [outcome.value for outcome in outcomes if outcome is not None] == ["fine"] * 2

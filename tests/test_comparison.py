@@ -18,14 +18,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rich.console import Console
 
-import train.commands.compare
+import train.commands.comparison
 from baselines.catalogue import BEST_ON_THE_WALKER
 from baselines.residual.residual_folder import read_description
 from elastic_env.core.config import load_yaml
 from elastic_env.core.errors import ConfigurationError, MissingExtraError
 from tests.cells import METRIC, cell, describe, episode_rows, family, records
 from train.commands.cli import main
-from train.commands.compare import CompareConfig, _each_once
+from train.commands.compare_config import CompareConfig
+from train.commands.comparison import _distinct_conditions
 from train.evaluate.changes import (
     CEILING,
     SAME_ROBOT,
@@ -51,7 +52,7 @@ from train.figures.comparison_figures import has_swept_references
 from train.report.change_tables import cells_table, changes_table, print_changes, write_statistics
 from train.report.page import Page
 from train.report.report_text import Results
-from train.report.table_formats import to_terminal
+from train.report.terminal import to_terminal
 from train.report.write import require_libraries, require_plotly, write_report
 from train.runs.folders import run_folder
 
@@ -793,7 +794,7 @@ def compared(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
 
     with pytest.MonkeyPatch.context() as patch, (root / "printed.txt").open("w") as file:
         patch.chdir(root)
-        patch.setattr(train.commands.compare, "run_conditions", run)
+        patch.setattr(train.commands.comparison, "run_conditions", run)
         patch.setattr("train.commands.cli.CONSOLE", Console(width=160, file=file))
         main(["compare", "two.yaml"])
     return root / "runs" / "two", (root / "printed.txt").read_text()
@@ -853,7 +854,7 @@ def test_each_environment_and_each_policy_is_tried_out() -> None:
     are all tried."""
     named = {"policies": ["input", "dynamic"], "scenarios": ["soft", "stiff", "sensor"]}
     conditions = CompareConfig(name="c", env="walker", references=[3, 1.6], **named).conditions()  # type: ignore[arg-type]
-    tried = list(_each_once(conditions))
+    tried = list(_distinct_conditions(conditions))
     assert len(tried) == 2 * (3 + 1) < len(conditions)
     for key in (lambda c: repr(c.arguments), lambda c: (c.policy.name, c.reference)):
         assert {key(c) for c in tried} == {key(c) for c in conditions}
@@ -864,7 +865,7 @@ def test_a_policy_with_sensors_of_its_own_is_tried_out_once_at_a_motion() -> Non
     place of 39."""
     config = load_yaml(Path(__file__).parents[1] / "configs" / "leaderboard.yaml", CompareConfig)
     conditions = config.conditions()
-    tried = list(_each_once(conditions))
+    tried = list(_distinct_conditions(conditions))
     assert len({repr(c.arguments) for c in tried}) == 39
     for key in (lambda c: c.cell, lambda c: (c.policy.title, c.reference_name)):
         assert {key(c) for c in tried} == {key(c) for c in conditions}

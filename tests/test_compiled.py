@@ -27,7 +27,7 @@ import elastic_env  # noqa: F401  registers the environments
 from elastic_env.core import compiled as module
 from elastic_env.core.compiled import compile_now, compiled
 from elastic_env.world import control_kernels as kernels
-from train.runs.progress import say_what_is_compiled
+from train.runs.progress import announce_compilation
 
 ROOT = Path(__file__).parents[1]
 KERNELS = (
@@ -199,7 +199,7 @@ def test_a_command_says_once_that_functions_of_ours_are_compiled(tmp_path: Path)
         kept = importlib.util.module_from_spec(spec)
         spec.loader.exec_module(kept)
         console = Console(file=io.StringIO())
-        with say_what_is_compiled(console):
+        with announce_compilation(console):
             assert numba.njit(lambda value: value + 1.0)(1.5) == 2.5  # of the user's
             said.append(console.file.getvalue())  # type: ignore[attr-defined]
             assert kept.eight_times(1.5) == 12.0

@@ -23,10 +23,10 @@ from rich.text import Text
 
 from train.figures import plots
 from train.figures.chart import Chart, Curve, Panel
+from train.report.markdown import to_markdown
 from train.report.page import Page
-from train.report.table_formats import Table as ReportTable
-from train.report.table_formats import to_markdown
-from train.runs.console import PlainConsole, traceback_of, visible_warnings
+from train.report.tables import Table as ReportTable
+from train.runs.console import PlainConsole, traceback_text, visible_warnings
 from train.runs.escaping import (
     chart_text,
     csv_cell,
@@ -152,7 +152,7 @@ def test_progress_and_warnings_obey_no_text() -> None:
         said = warnings.formatwarning(f"the joint {HOSTILE}", UserWarning, "file.py", 3)
     assert "the joint a�" in said
     assert not set(COMMANDS) & set(said)
-    assert not set(COMMANDS) & set(traceback_of(ValueError(HOSTILE)))
+    assert not set(COMMANDS) & set(traceback_text(ValueError(HOSTILE)))
 
 
 def test_files_obey_no_text(tmp_path: Path) -> None:

@@ -22,9 +22,9 @@ from elastic_env.core.errors import ConfigurationError, SystemFailedError
 from train.commands.cli import COMMANDS, main
 from train.evaluate.conditions import Condition, PolicySpec
 from train.evaluate.rollout import PolicyFailedError, policy_errors
-from train.runs.failures import EndedError, explain
+from train.runs.failures import SignalError, explain
 from train.runs.progress import duration, plain_progress
-from train.workers.calls import WorkerKilledError
+from train.workers.pool import WorkerKilledError
 
 CONFIGS = Path(__file__).parents[1] / "configs"
 POLICIES = """
@@ -298,7 +298,7 @@ def test_an_interrupt_while_modules_load_is_one_word() -> None:
     assert "Traceback" not in said
 
 
-@pytest.mark.parametrize("asked", [KeyboardInterrupt, EndedError])
+@pytest.mark.parametrize("asked", [KeyboardInterrupt, SignalError])
 def test_an_interrupt_that_c_code_quotes_is_an_interrupt(asked: type[KeyboardInterrupt]) -> None:
     """Catches "a defect" where Ctrl-C comes while `ctypes` converts an argument, as while Numba
     compiles."""
@@ -380,7 +380,7 @@ def test_long_work_is_announced(
     now = 0.0
     out = io.StringIO()
     monkeypatch.setattr(time, "monotonic", lambda: now)
-    say = plain_progress(Console(file=out), least_s=10.0)
+    say = plain_progress(Console(file=out), interval_s=10.0)
     for percent in range(1, 101):
         now = whole_s * percent / 100.0
         say(percent / 100.0)

@@ -13,32 +13,32 @@ import pytest
 import yaml
 from rich.console import Console
 
-import train.commands.compare
+import train.commands.comparison
 import train.speed.step_times
 from baselines.catalogue import Track
 from elastic_env.core.config import load_yaml
 from elastic_env.core.errors import ConfigurationError
 from tests.cells import METRIC, cell, family
 from train.commands.cli import main
-from train.commands.compare import CompareConfig, Sweep
+from train.commands.compare_config import CompareConfig, Sweep
 from train.evaluate.changes import changes
 from train.evaluate.conditions import Condition, PolicySpec
 from train.evaluate.episodes import Evaluation, evaluate
 from train.evaluate.standings import Paired, Standing, standings
 from train.evaluate.statistics import Estimate, over_seeds
 from train.report.leaderboard import (
-    board,
     claims_table,
     find_published,
     leaderboard_markdown,
+    leaderboard_table,
     print_leaderboard,
     read_leaderboard,
-    scenarios_board,
+    scenarios_table,
     three_digits,
     write_leaderboard,
 )
 from train.report.report_text import Results
-from train.report.table_formats import Cell, Table, plain_text
+from train.report.tables import Cell, Table, plain_text
 from train.report.write import write_report
 from train.runs.folders import run_folder
 from train.speed.step_times import step_times
@@ -170,14 +170,14 @@ def test_a_residual_is_compared_with_the_best_of_each_column() -> None:
 def test_columns_are_whole_groups_and_what_is_in_none() -> None:
     """Catches a group that is shown though one of its scenarios is not played, and a scenario
     that nobody sees."""
-    assert titles(board(rows())) == ["both, 3 s", "all, 3 s", "soft, 1.6 s"]
-    single = scenarios_board(rows())
+    assert titles(leaderboard_table(rows())) == ["both, 3 s", "all, 3 s", "soft, 1.6 s"]
+    single = scenarios_table(rows())
     assert single is not None
     assert titles(single) == ["soft, 3 s", "ideal, 3 s", "slope, 3 s"]
     found = [e for e in played() if e.condition.reference == 3]
     without = standings(found, {}, {})
-    assert titles(board(without)) == titles(single)
-    assert scenarios_board(without) is None
+    assert titles(leaderboard_table(without)) == titles(single)
+    assert scenarios_table(without) is None
 
 
 # The table.
@@ -185,7 +185,7 @@ def test_columns_are_whole_groups_and_what_is_in_none() -> None:
 
 def test_tracks_hold_those_with_the_same_needs_the_best_first() -> None:
     """Catches a policy of one's own in the wrong track, and an order by name."""
-    assert {name: list(own) for name, own in tracks(board(rows())).items()} == {
+    assert {name: list(own) for name, own in tracks(leaderboard_table(rows())).items()} == {
         str(Track.STANDARD): ["best", "base"],
         str(Track.TORQUE_SENSORS): ["sensor"],
         str(Track.TRAINING): ["learned"],
@@ -200,7 +200,7 @@ def test_tracks_hold_those_with_the_same_needs_the_best_first() -> None:
 
 def test_the_best_of_a_track_has_the_fewest_falls_first() -> None:
     """Catches a mark for who fell in the hard episodes, and a track without any."""
-    standard, sensors, _ = tracks(board(rows())).values()
+    standard, sensors, _ = tracks(leaderboard_table(rows())).values()
     best = standard["best"]
     base = standard["base"]
     sensor = sensors["sensor"]
@@ -413,11 +413,11 @@ def play_quickly(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         played.extend(condition.policy.title for condition in conditions)
         return [evaluate(condition, num_threads=1) for condition in conditions]
 
-    monkeypatch.setattr(train.commands.compare, "run_conditions", run)
+    monkeypatch.setattr(train.commands.comparison, "run_conditions", run)
     monkeypatch.setattr(
-        train.commands.compare, "step_times", lambda cells: step_times(cells, steps=2, rounds=1)
+        train.commands.comparison, "step_times", lambda cells: step_times(cells, steps=2, rounds=1)
     )
-    monkeypatch.setattr(train.commands.compare, "draw_figures", lambda *_: [])
+    monkeypatch.setattr(train.commands.comparison, "draw_figures", lambda *_: [])
     return played
 
 

@@ -16,7 +16,7 @@ from elastic_env.core.config import load_yaml
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.world.scenario import make_scenario
 from tests.cells import METRIC, cell, family
-from train.commands.compare import CompareConfig
+from train.commands.compare_config import CompareConfig
 from train.evaluate.changes import changes
 from train.evaluate.conditions import Condition, PolicySpec, scenario_fields, vary_scenario
 from train.evaluate.episodes import Evaluation

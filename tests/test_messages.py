@@ -23,7 +23,7 @@ from elastic_env.core.errors import (
 from elastic_env.robots.gallery import gallery_robot
 from train.commands.bench import BenchConfig
 from train.commands.cli import main
-from train.commands.compare import CompareConfig
+from train.commands.compare_config import CompareConfig
 from train.evaluate.conditions import PolicySpec
 from train.evaluate.environments import environment
 from train.evaluate.rollout import make_policy

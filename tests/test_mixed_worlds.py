@@ -14,7 +14,7 @@ from baselines.compensation.policy import Zero
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
 from train.cells import play
-from train.cells.play import in_batches
+from train.cells.play import make_batches
 from train.evaluate import rollout
 from train.evaluate.conditions import Condition, PolicySpec
 from train.evaluate.episodes import evaluate, evaluate_together
@@ -183,7 +183,7 @@ def test_batches_hold_cells_of_one_policy_and_leave_work_for_every_core() -> Non
         for scenario in scenarios
         for name in ("input", "oracle", "iterative", "dynamic")
     ]
-    batches = in_batches(cells, cores=1)
+    batches = make_batches(cells, cores=1)
     assert sorted(number for batch in batches for number in batch) == list(range(len(cells)))
     found = [
         {(cells[number].policy.name, cells[number].scenario) for number in batch}
@@ -194,12 +194,12 @@ def test_batches_hold_cells_of_one_policy_and_leave_work_for_every_core() -> Non
         assert {(policy, scenario) for scenario in scenarios[1:]} in found
     alone = [batch for batch in found if {"oracle", "iterative"} & {policy for policy, _ in batch}]
     assert [len(batch) for batch in alone] == [1] * 12
-    assert len(in_batches(cells, cores=8)) >= 16
-    assert all(len(batch) == 1 for batch in in_batches(cells, cores=len(cells)))
+    assert len(make_batches(cells, cores=8)) >= 16
+    assert all(len(batch) == 1 for batch in make_batches(cells, cores=len(cells)))
     testbed = [
         Condition(policy=PolicySpec(name="input"), scenario=name) for name in ("nominal", "soft")
     ]
-    assert in_batches(testbed, cores=1) == [[0], [1]]
+    assert make_batches(testbed, cores=1) == [[0], [1]]
 
 
 def test_a_map_of_a_scenario_shares_worlds_and_varied_options_do_not() -> None:
@@ -208,11 +208,11 @@ def test_a_map_of_a_scenario_shares_worlds_and_varied_options_do_not() -> None:
         cell("input", "nominal", swept={"scenario.stiffness": value})
         for value in (0.8, 0.9, 1.0, 1.1)
     ]
-    assert in_batches(cells, cores=1) == [[0, 1], [2, 3]]
+    assert make_batches(cells, cores=1) == [[0, 1], [2, 3]]
     cells = [
         cell("input", "nominal", swept={"stiffness_scale": value}) for value in (0.8, 0.9, 1.0, 1.1)
     ]
-    assert in_batches(cells, cores=1) == [[0], [1], [2], [3]]
+    assert make_batches(cells, cores=1) == [[0], [1], [2], [3]]
 
 
 def failing(env: Any) -> Any:

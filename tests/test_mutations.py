@@ -21,13 +21,13 @@ from elastic_env.core.json_text import parse_json
 from elastic_env.world.physics import substeps
 from tests.mutations import RESIDUALS
 from train.commands.bench import BenchConfig
-from train.commands.compare import CompareConfig
+from train.commands.compare_config import CompareConfig
 from train.evaluate.conditions import PolicySpec
 from train.evaluate.environments import environment
 from train.evaluate.residual_seeds import expand
 from train.evaluate.rollout import make_policy
 from train.learn.train_config import TrainConfig, training_worlds
-from train.runs.user_code import TELLING
+from train.runs.user_code import KINDS
 
 ROOT = Path(__file__).parents[1]
 LONGEST_S = 300
@@ -188,7 +188,7 @@ def test_a_configuration_of_another_command_is_recognised(
 def test_telling_keys_are_those_of_one_kind_alone() -> None:
     """Catches a key that was renamed, and one that tells nothing."""
     models = {"comparison": CompareConfig, "training": TrainConfig, "bench": BenchConfig}
-    for kind, (_, keys) in TELLING.items():
+    for kind, (_, keys) in KINDS.items():
         others = {
             name for other, model in models.items() if other != kind for name in model.model_fields
         }

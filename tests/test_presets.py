@@ -8,10 +8,11 @@ import pytest
 from elastic_env.core.config import load_yaml
 from train.commands.bench import BenchConfig
 from train.commands.cli import main
-from train.commands.compare import CompareConfig, Comparison
+from train.commands.compare_config import CompareConfig
+from train.commands.comparison import Comparison
 from train.learn.train_config import TrainConfig
 from train.runs.presets import find_configuration, first_sentence, presets
-from train.runs.user_code import TELLING, kind_of
+from train.runs.user_code import KINDS, kind_of
 
 ROOT = Path(__file__).parents[1]
 MODELS: dict[str, Any] = {
@@ -53,9 +54,7 @@ def test_both_lists_hold_each_preset_once_and_say_what_it_is(
 ) -> None:
     """Catches a preset that no command lists, that the wrong one lists, or that cannot be
     played."""
-    lists = {
-        kind: listed(TELLING[kind][0].split()[1], capsys) for kind in MODELS if kind != "bench"
-    }
+    lists = {kind: listed(KINDS[kind][0].split()[1], capsys) for kind in MODELS if kind != "bench"}
     for name, file in presets().items():
         owners = [kind for kind, text in lists.items() if f"│ {name} │" in text]
         config = load_yaml(file, MODELS[owners[0] if owners else "bench"])

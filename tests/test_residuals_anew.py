@@ -18,7 +18,7 @@ from tests.residuals_anew import (
     reproduce,
     shipped_seeds,
 )
-from train.commands.compare import CompareConfig
+from train.commands.compare_config import CompareConfig
 from train.workers.executors import Executors
 
 TRAINING = """\

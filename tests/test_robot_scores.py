@@ -18,7 +18,7 @@ from elastic_env.core.signals import Array
 from elastic_env.robots.thormang.config import robot_bank
 from elastic_env.world.scenario import TRAINING_RANGES, make_scenario
 from tests.cells import METRIC, cell, episode_rows, family, records
-from train.commands.compare import CompareConfig
+from train.commands.compare_config import CompareConfig
 from train.evaluate.changes import HELD_OUT, changes
 from train.evaluate.conditions import Condition, PolicySpec
 from train.evaluate.episodes import evaluate

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-import train.commands.compare
+import train.commands.comparison
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
 from elastic_env.joint.elasticity import ElasticJoint
@@ -50,7 +50,7 @@ def tried(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     files = {"model": str(EXAMPLE), "stiffness": str(JOINTS), "output": root / "arm"}
     trial = Robot(**files, end_effector="tool", poses=QUICK, motion=SINE)
     with pytest.MonkeyPatch.context() as patch, (root / "printed.txt").open("w") as file:
-        patch.setattr(train.commands.compare, "run_conditions", in_this_process)
+        patch.setattr(train.commands.comparison, "run_conditions", in_this_process)
         folder, files = try_robot(trial, Console(width=160, file=file))
     assert all(made.is_file() for made in files)
     return folder, (root / "printed.txt").read_text()

@@ -15,13 +15,13 @@ from rich.console import Console
 
 from elastic_env.core.errors import ConfigurationError, SystemFailedError
 from elastic_env.core.files import read_bounded, write_whole
-from train.commands.compare import CompareConfig
+from train.commands.compare_config import CompareConfig
 from train.learn.run_training import resume
 from train.runs.folders import (
-    describe,
-    free_folder,
+    create_folder,
     lock_run,
     record_results,
+    record_run,
     require_run,
     run_folder,
 )
@@ -40,7 +40,7 @@ def test_programs_that_begin_at_the_same_moment_get_a_folder_each() -> None:
 
     def begin() -> None:
         barrier.wait()
-        found.append(free_folder("x"))
+        found.append(create_folder("x"))
 
     threads = [threading.Thread(target=begin) for _ in range(30)]
     for thread in threads:
@@ -57,7 +57,7 @@ def test_programs_that_begin_at_the_same_moment_get_a_folder_each() -> None:
 def test_a_name_leads_nowhere_else(name: str, tmp_path: Path) -> None:
     """Catches a configuration that writes outside of runs."""
     with pytest.raises(ConfigurationError, match="name must be the name of a folder in runs"):
-        free_folder(name)
+        create_folder(name)
     assert not (tmp_path / "runs").exists()
 
 
@@ -70,7 +70,7 @@ def test_what_is_in_the_way_is_said(obstacle: str, tmp_path: Path) -> None:
     else:
         runs.symlink_to(tmp_path / "nowhere")
     with pytest.raises(SystemFailedError, match="no folder for results can be made at runs"):
-        free_folder("x")
+        create_folder("x")
 
 
 def test_a_run_that_cannot_be_described_leaves_no_folder(
@@ -265,17 +265,17 @@ def test_results_of_another_configuration_do_not_stay(tmp_path: Path) -> None:
     folder.mkdir()
     (tmp_path / "mine.txt").write_text("mine")
     (folder / "notes.md").write_text("mine")
-    describe(folder, {"policy": "input"}, 0)
+    record_run(folder, {"policy": "input"}, 0)
     (folder / "report.md").write_text("input")
     record_results(folder, [folder / "report.md"])
-    describe(folder, {"policy": "input"}, 0)
+    record_run(folder, {"policy": "input"}, 0)
     assert (folder / "report.md").is_file()
-    describe(folder, {"policy": "dynamic"}, 0)
+    record_run(folder, {"policy": "dynamic"}, 0)
     assert not (folder / "report.md").exists()
     for results in (["../mine.txt", "metadata.json", "config.yaml", "..", ".", 3, ["x"]], 7, "n"):
         content = json.loads((folder / "metadata.json").read_text())
         (folder / "metadata.json").write_text(json.dumps({**content, "results": results}))
-        describe(folder, {"policy": "zero"}, 0)
+        record_run(folder, {"policy": "zero"}, 0)
         assert sorted(file.name for file in folder.iterdir()) == [
             "config.yaml",
             "metadata.json",

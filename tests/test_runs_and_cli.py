@@ -24,12 +24,12 @@ import yaml
 from PIL import Image, ImageSequence
 from rich.console import Console
 
-import train.commands.compare
+import train.commands.comparison
 import train.commands.demo
 import train.commands.speed
 import train.evaluate.episodes
 import train.report.summary
-import train.speed.contenders
+import train.speed.foreign_loops
 from baselines.catalogue import ON_JOINTS, ON_THE_WALKER
 from baselines.identification.identify import Identification
 from elastic_env.core.config import load_yaml
@@ -38,13 +38,13 @@ from elastic_env.core.signals import Array
 from elastic_env.world.joint_task import METRICS_OF_ONE as METRICS
 from tests.test_identification import synthetic
 from train.commands.cli import main
-from train.commands.compare import CompareConfig
+from train.commands.compare_config import CompareConfig
 from train.commands.play import play
 from train.evaluate.conditions import Condition, PolicySpec
 from train.evaluate.episodes import Evaluation, evaluate
 from train.evaluate.rollout import PolicyFailedError
 from train.runs.console import shown_warnings, warn_once
-from train.runs.folders import free_folder, run_folder
+from train.runs.folders import create_folder, run_folder
 from train.runs.progress import show_progress
 from train.speed.contenders import RawWorlds, ScalarLoop, VectorLoop
 
@@ -103,7 +103,7 @@ def in_process(monkeypatch: pytest.MonkeyPatch) -> None:
     def run(conditions: Sequence[Condition], console: Console, *_: object) -> list[Evaluation]:
         return [evaluate(condition, num_threads=1) for condition in conditions]
 
-    monkeypatch.setattr(train.commands.compare, "run_conditions", run)
+    monkeypatch.setattr(train.commands.comparison, "run_conditions", run)
     monkeypatch.setattr(train.commands.demo, "run_conditions", run)
 
 
@@ -273,8 +273,8 @@ def test_metadata_says_seed_versions_and_commit() -> None:
 def test_named_output_folder_may_be_new_or_empty(tmp_path: Path) -> None:
     """Catches a folder that must exist, and one that must not."""
     (tmp_path / "empty").mkdir()
-    assert free_folder("x", tmp_path / "empty") == tmp_path / "empty"
-    assert free_folder("x", tmp_path / "deep" / "new") == tmp_path / "deep" / "new"
+    assert create_folder("x", tmp_path / "empty") == tmp_path / "empty"
+    assert create_folder("x", tmp_path / "deep" / "new") == tmp_path / "deep" / "new"
 
 
 @pytest.mark.parametrize("kind", ["folder", "file"])
@@ -285,7 +285,7 @@ def test_output_that_exists_is_refused(kind: str, tmp_path: Path) -> None:
     inside.parent.mkdir(exist_ok=True)
     inside.write_text("years of work")
     with pytest.raises(ResultsExistError, match="taken"):
-        free_folder("x", output)
+        create_folder("x", output)
     assert files_of(tmp_path) == {str(inside.relative_to(tmp_path)): b"years of work"}
 
 
@@ -488,7 +488,7 @@ def test_output_that_holds_results_is_refused_before_the_work(
     Path("taken").mkdir()
     Path("taken/notes.txt").write_text("keep me")
     for name in (
-        "train.commands.compare.run_conditions",
+        "train.commands.comparison.run_conditions",
         "train.commands.identify.identify",
         "train.commands.speed.measure",
     ):
@@ -922,7 +922,7 @@ def test_speed_of_learning_end_to_end(policy: str, monkeypatch: pytest.MonkeyPat
     policy of the user's."""
     own = "import baselines\n\n\ndef make(env):\n    return baselines.make('zero', env)\n"
     Path("mine.py").write_text(own)
-    monkeypatch.setattr(train.speed.contenders, "PPO_DECISIONS", 32)
+    monkeypatch.setattr(train.speed.foreign_loops, "PPO_DECISIONS", 32)
     main([*SPEED, "--env", "testbed", "--num-envs", "2", "--no-others", "--policy", policy])
     ours, processes = json.loads(Path("runs/speed/speed.json").read_text())[-2:]
     assert (ours["contender"], ours["num_envs"]) == (f"PPO with {policy}, vector env", 64)

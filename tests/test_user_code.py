@@ -11,7 +11,7 @@ import pytest
 from elastic_env.core.errors import ConfigurationError
 from train.evaluate.conditions import PolicySpec
 from train.evaluate.rollout import control_steps, make_policy
-from train.runs.import_path import leave, look_last_in
+from train.runs.import_path import append_to_path, remove_from_path
 from train.runs.user_code import named_object
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -166,10 +166,10 @@ def test_the_path_keeps_its_order_but_for_the_working_folder(
     others = [entry for entry in sys.path if entry and Path(entry).resolve() != tmp_path]
     for first in ("", ".", str(tmp_path)):
         monkeypatch.setattr(sys, "path", [first, *others])
-        leave(tmp_path)
+        remove_from_path(tmp_path)
         assert tmp_path not in map(Path, sys.path)
-        look_last_in(tmp_path)
-        look_last_in(tmp_path)
+        append_to_path(tmp_path)
+        append_to_path(tmp_path)
         assert sys.path[-1] == str(tmp_path)
         assert [entry for entry in sys.path if entry in others] == others
         assert sys.path.count(str(tmp_path)) == 1
@@ -184,7 +184,7 @@ def test_a_module_that_stands_before_the_users_file_is_named(
     (tmp_path / "train.py").write_text("def make(env):\n    return 42\n")
     with pytest.raises(
         ConfigurationError,
-        match=r"stands before your train\.py; name the file itself: train\.py:make",
+        match=r"is imported instead of your train\.py; name the file itself: train\.py:make",
     ):
         named_object("train:make")
 

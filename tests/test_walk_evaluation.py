@@ -15,7 +15,7 @@ from gymnasium.vector import AutoresetMode
 from PIL import Image
 from rich.console import Console
 
-import train.commands.compare
+import train.commands.comparison
 from baselines.residual_env import ResidualVectorWrapper
 from baselines.walking.controller import LocalFrame, local_frame
 from elastic_env.core.config import load_yaml
@@ -25,7 +25,8 @@ from elastic_env.motion.gait import LEFT, RIGHT
 from elastic_env.rigid.leg_kinematics import rotation_x, rotation_y
 from elastic_env.world.robot_model import WalkerModel
 from train.commands.cli import main
-from train.commands.compare import CompareConfig, try_out
+from train.commands.compare_config import CompareConfig
+from train.commands.comparison import try_out
 from train.evaluate.conditions import Condition, PolicySpec
 from train.evaluate.episodes import Evaluation, evaluate
 from train.evaluate.rollout import make_vector_env
@@ -98,7 +99,7 @@ def in_process(monkeypatch: pytest.MonkeyPatch) -> None:
     def run(conditions: Sequence[Condition], console: Console, *_: object) -> list[Evaluation]:
         return [evaluate(condition, num_threads=1) for condition in conditions]
 
-    monkeypatch.setattr(train.commands.compare, "run_conditions", run)
+    monkeypatch.setattr(train.commands.comparison, "run_conditions", run)
 
 
 @pytest.fixture(scope="module")

@@ -16,7 +16,8 @@ import yaml
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.robots.thormang.tables import BLOCKS
 from train.evaluate.episodes import group_by
-from train.report.table_formats import Table, to_markdown
+from train.report.markdown import to_markdown
+from train.report.tables import Table
 from train.runs.escaping import write_csv
 
 Rows = Sequence[Mapping[str, str]]

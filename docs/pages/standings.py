@@ -4,8 +4,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from train.evaluate.standings import Standing
-from train.report.leaderboard import board
-from train.report.table_formats import Cell, parts_of, to_markdown
+from train.report.leaderboard import leaderboard_table
+from train.report.markdown import to_markdown
+from train.report.tables import Cell, parts_of
 
 _JUDGED = (
     ("mixture", "3 s"),
@@ -21,7 +22,7 @@ _JUDGED = (
 
 def board_markdown(found: Sequence[Standing]) -> str:
     """The judged columns of the leaderboard, without intervals."""
-    table = board(found)
+    table = leaderboard_table(found)
     for place in reversed(range(len(table.heads))):
         head = table.heads[place]
         if head.second and (head.title, head.second) not in _JUDGED:

@@ -1,1 +1,1 @@
-"""Cells of a comparison: played wherever there are workers, and kept by their content."""
+"""Cells of a comparison: played by workers, and stored under digests of their conditions."""

@@ -1,1 +1,1 @@
-"""The commands of `elastic`: a module each, with its options, its help and its work."""
+"""The commands of `elastic`: a module for each, with its options, help and work."""

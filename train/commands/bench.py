@@ -1,4 +1,4 @@
-"""`elastic bench`: short rollouts whose figures a CI guards; seconds long, without torch."""
+"""`elastic bench`: compare short rollouts with accepted figures, in CI and without torch."""
 
 import json
 import os
@@ -37,14 +37,16 @@ from train.evaluate.conditions import (
 from train.evaluate.episodes import Evaluation, group_by
 from train.evaluate.statistics import Estimate
 from train.evaluate.table import over_cells
-from train.report.table_formats import Head, Row, Table, print_table, to_markdown
-from train.runs.annotations import annotation, in_workflow
+from train.report.markdown import to_markdown
+from train.report.tables import Head, Row, Table
+from train.report.terminal import print_table
+from train.runs.annotations import annotation, runs_in_workflow
 from train.runs.folders import run_folder
-from train.runs.user_code import CodeNamingModel, is_a, load_without_code
+from train.runs.user_code import CodeNamingModel, kind_check, load_without_code
 
-USUAL = Path("configs/bench.yaml")
-"""The default configuration; in a checkout it is that of the package."""
-_SHIPPED = Path(__file__).with_name("bench.yaml")
+DEFAULT_CONFIG = Path("configs/bench.yaml")
+"""The default configuration; a checkout of the package has it."""
+_PACKAGE_CONFIG = Path(__file__).with_name("bench.yaml")
 
 
 Margin = Annotated[float, Field(ge=0, le=100)]
@@ -52,7 +54,7 @@ Margin = Annotated[float, Field(ge=0, le=100)]
 
 
 class BenchCase(Model):
-    """A short rollout and the figures that it must keep."""
+    """A short rollout and its accepted figures."""
 
     env: str
     policy: Locator
@@ -67,10 +69,10 @@ class BenchCase(Model):
     episodes: NumEpisodes = 1
     """Episodes, with seeds that follow; a figure is the mean over them."""
     figures: dict[str, float | None] = Field(min_length=1, max_length=MOST_ENTRIES)
-    """Metrics of the episodes with what was accepted; null where `--update` has not measured.
-    Their size counts, and smaller is better."""
+    """Metrics of the episodes with accepted values; null until `--update` measures them. Their
+    absolute value counts, and smaller is better."""
     margins: dict[str, Margin] = {}
-    """Margins of single figures, in place of that of the file."""
+    """Margins of single figures, instead of the margin of the file."""
 
     @model_validator(mode="after")
     def _margins_are_of_figures(self) -> Self:
@@ -89,9 +91,8 @@ class BenchConfig(CodeNamingModel):
 
     name: Title = "bench"
     margin: float = quantity("1", 0.05, ge=0, le=100)
-    """Relative amount by which a figure may exceed the accepted, where it has no margin of its own.
-    """
-    _kind = model_validator(mode="before")(is_a("bench"))
+    """Relative amount by which a figure without its own margin may exceed the accepted one."""
+    _kind = model_validator(mode="before")(kind_check("bench"))
     cases: Entries[BenchCase]
 
     @property
@@ -102,12 +103,11 @@ class BenchConfig(CodeNamingModel):
 
 
 class Bench(Model):
-    """Guard figures in CI: short rollouts of both environments against what was accepted.
+    """Guard figures in CI: compare short rollouts of both environments with accepted figures.
 
-    Exit code 1, and a line for every figure that falls short, which stand first in the table. In
+    A worse figure gives exit code 1 and a line, and its rollout comes first in the table. In
     GitHub's workflows these lines are annotations of the configuration, and the table is appended
-    to the file that $GITHUB_STEP_SUMMARY names. Example, to accept new figures: elastic bench
-    --update
+    to the file in $GITHUB_STEP_SUMMARY. Example, to accept new figures: elastic bench --update
     """
 
     config: Annotated[Path | None, tyro.conf.Positional] = None
@@ -115,26 +115,21 @@ class Bench(Model):
     does not run unless it is named; where that does not exist, the configuration of the package.
     """
     update: bool = False
-    """Accept what is measured now: the figures in the configuration change, and nothing else of
-    it.
-    """
+    """Accept the measured figures: replace the figures in the configuration, and nothing else."""
     output: Path | None = None
     """Folder for bench.json and bench.md, new or empty; default runs/bench, numbered if taken."""
 
     def run(self, console: Console) -> None:
         """Play the rollouts, and write and print their figures."""
-        path = configuration(self.config or USUAL, self.update)
-        if path == _SHIPPED:
-            console.print(f"there is no {USUAL}; these are the rollouts of the package")
-        if self.config is None:  # it was found, and nobody named it
-            cure = f"name it: elastic bench {path}"
-            config = load_without_code(path, BenchConfig, cure)
+        path = find_config(self.config or DEFAULT_CONFIG, self.update)
+        if path == _PACKAGE_CONFIG:
+            console.print(f"there is no {DEFAULT_CONFIG}; these are the rollouts of the package")
+        if self.config is None:  # the user did not name it
+            config = load_without_code(path, BenchConfig, f"name it: elastic bench {path}")
         else:
             config = load_yaml(path, BenchConfig)
-        recorded = config.model_dump(mode="json")
-        with run_folder(config.name, recorded, None, self.output) as folder:
-            conditions = [case.condition for case in config.cases]
-            evaluations = run_conditions(conditions, console)
+        with run_folder(config.name, config.model_dump(mode="json"), None, self.output) as folder:
+            evaluations = run_conditions([case.condition for case in config.cases], console)
             figures = list[_Figure]()
             for case, evaluation in zip(config.cases, evaluations, strict=True):
                 figures += _figures(case, evaluation, config.margin)
@@ -150,98 +145,99 @@ class Bench(Model):
         if self.update:
             accepted = _accept(path, evaluations)
             console.print(f"accepted {accepted} of {len(figures)} figures into {path}")
-        short = [one for one in figures if one["problem"]]
+        failures = [figure for figure in figures if figure["problem"]]
         if self.update:
-            short = [one for one in figures if one["measured"] is None]
-        for one in short:
-            problem = f"{one['case']}: {one['problem']}"
-            console.print(annotation(problem, path) if in_workflow() else problem)
-        if short:
+            failures = [figure for figure in figures if figure["measured"] is None]
+        for figure in failures:
+            problem = f"{figure['case']}: {figure['problem']}"
+            console.print(annotation(problem, path) if runs_in_workflow() else problem)
+        if failures:
             sys.exit(1)
 
 
-def configuration(path: Path, update: bool = False) -> Path:
-    """The configuration that is meant: where the usual one does not exist, that of the package.
+def find_config(path: Path, update: bool = False) -> Path:
+    """Return a path, or the package's configuration if the path is the default and has no file.
 
     Raises:
-        ConfigurationError: The one of the package is to be changed.
+        ConfigurationError: `update` would change the configuration of the package.
     """
-    if path != USUAL or path.exists():
+    if path != DEFAULT_CONFIG or path.exists():
         return path
     if update:
-        cure = f"copy {_SHIPPED} there first"
-        raise ConfigurationError(f"there is no {USUAL} to update; {cure}")
-    return _SHIPPED
+        cure = f"copy {_PACKAGE_CONFIG} there first"
+        raise ConfigurationError(f"there is no {DEFAULT_CONFIG} to update; {cure}")
+    return _PACKAGE_CONFIG
 
 
 _UNITS = ("_m", "_rad", "_s", "_nm", "_share", "_count")
-"""Ends of the names of metrics."""
+"""Suffixes of metrics."""
 _Figure = dict[str, Any]
-"""A figure of a rollout: measured, accepted and largest value, and what is wrong in words.
+"""A figure of a rollout: measured, accepted and largest value, and its problem in words.
 
-`measured` is None where the episode failed or does not have the figure; `interval` is that of
-several episodes, 95 %.
+`measured` is None if the episode failed or lacks the figure; `interval` is the 95 % interval over
+several episodes.
 """
 
 
-def _figures(case: BenchCase, found: Evaluation, margin: float) -> Iterator[_Figure]:
-    motion = found.condition.reference_name
+def _figures(case: BenchCase, evaluation: Evaluation, margin: float) -> Iterator[_Figure]:
+    motion = evaluation.condition.reference_name
     policy = f"{case.policy} {case.options}" if case.options else case.policy
-    known = [name for name in found.episodes[0] if name.endswith(_UNITS)]
-    if not found.num_failed:
-        require_known(f"metric of the {case.env}", case.figures, known)
+    metrics = [name for name in evaluation.episodes[0] if name.endswith(_UNITS)]
+    if not evaluation.num_failed:
+        require_known(f"metric of the {case.env}", case.figures, metrics)
     for metric, accepted in case.figures.items():
-        score = _score(found, metric)
-        own = case.margins.get(metric, margin)
+        score = _score(evaluation, metric)
+        factor = 1.0 + case.margins.get(metric, margin)
         figure: _Figure = {
             "case": f"{case.env}, {motion}, {case.scenario}, {policy}",
             "metric": metric,
             "measured": score and score.value,
             "interval": score.ends if score and score.has_interval else None,
             "accepted": accepted,
-            "bound": None if accepted is None else (1.0 + own) * abs(accepted),
+            "bound": None if accepted is None else factor * abs(accepted),
         }
-        yield {**figure, "problem": _problem(figure, found)}
+        yield {**figure, "problem": _problem(figure, evaluation)}
 
 
-def _score(found: Evaluation, metric: str) -> Estimate | None:
-    """Mean of a metric over the episodes; None where one of them failed or does not have it."""
-    values = found.values(metric)
-    is_whole = len(values) == len(found.episodes) and not np.isnan(values).any()
+def _score(evaluation: Evaluation, metric: str) -> Estimate | None:
+    """Return the mean of a metric over the episodes; None if one failed or lacks the metric."""
+    values = evaluation.values(metric)
+    is_whole = len(values) == len(evaluation.episodes) and not np.isnan(values).any()
     return over_cells([values[None]]) if is_whole else None
 
 
-def _problem(figure: _Figure, found: Evaluation) -> str:
+def _problem(figure: _Figure, evaluation: Evaluation) -> str:
+    """Return why a figure is not accepted; empty if it is."""
     metric, measured, bound = (figure[key] for key in ("metric", "measured", "bound"))
-    terminations = [own["termination"] for own in found.episodes]
-    if ends := dict.fromkeys(filter(None, terminations)):
-        who = f"{found.num_failed} of {len(found.episodes)} episodes"
-        who = "the episode" if len(found.episodes) == 1 else who
-        return f"{metric} has no value: {who} ended as {' and '.join(map(repr, ends))}"
+    terminations = [episode["termination"] for episode in evaluation.episodes]
+    if failures := dict.fromkeys(filter(None, terminations)):
+        number = len(evaluation.episodes)
+        who = "the episode" if number == 1 else f"{evaluation.num_failed} of {number} episodes"
+        return f"{metric} has no value: {who} ended as {' and '.join(map(repr, failures))}"
     if measured is None:
         return f"{metric} of this episode is not a number"
     if bound is None:
         cure = "nothing was accepted yet; --update accepts it"
-        return f"{metric} is {_rounded(measured)}, and {cure}"
-    if float(_rounded(abs(measured))) <= bound:
+        return f"{metric} is {_figure_text(measured)}, and {cure}"
+    if float(_figure_text(abs(measured))) <= bound:
         return ""
     worse = f" ({_change(measured, figure['accepted'])})" if figure["accepted"] else ""
-    return f"{metric} is {_rounded(measured)}{worse}, at most {_rounded(bound)} is accepted"
+    return f"{metric} is {_figure_text(measured)}{worse}, at most {_figure_text(bound)} is accepted"
 
 
-def _rounded(figure: float) -> str:
-    """A figure as it is accepted and printed."""
+def _figure_text(figure: float) -> str:
+    """Return a figure as it is accepted and printed."""
     return f"{figure:.4g}"
 
 
 def _accept(path: Path, evaluations: list[Evaluation]) -> int:
-    """Write measured figures in the place of accepted ones; what stands around them stays.
+    """Replace accepted figures by measured ones; the text around them does not change.
 
     Returns:
-        How many were written.
+        Number of replaced figures.
 
     Raises:
-        ConfigurationError: A case takes its figures from another one.
+        ConfigurationError: A case has its figures from another case.
     """
     text = path.read_bytes().decode()
     cases = _child(yaml.compose(text), "cases").value
@@ -251,7 +247,7 @@ def _accept(path: Path, evaluations: list[Evaluation]) -> int:
         figures = _child(case, "figures")
         pairs = [] if figures is None else figures.value
         places = [(value.start_mark.index, value.end_mark.index) for _, value in pairs]
-        # an alias stands before: where its anchor does
+        # the position of an alias is that of its anchor, which comes earlier
         is_own = [*places] == sorted({*places}) and min(places, default=(0, 0))[0] > last
         if not is_own or any(key.value == "<<" for key, _ in pairs):
             problem = f"{path}: figures of cases.{number} stand elsewhere"
@@ -259,7 +255,7 @@ def _accept(path: Path, evaluations: list[Evaluation]) -> int:
         last = places[-1][0]
         for place, (key, _) in zip(places, pairs, strict=True):
             if (measured := _score(evaluation, key.value)) is not None:
-                changes[place] = _rounded(measured.value)
+                changes[place] = _figure_text(measured.value)
     for (begin, end), value in sorted(changes.items(), reverse=True):
         text = text[:begin] + (value if end > begin else f" {value}") + text[end:]
     write_whole(path.resolve(), text.encode())  # the user named it, maybe by a link
@@ -268,9 +264,6 @@ def _accept(path: Path, evaluations: list[Evaluation]) -> int:
 
 def _child(node: Any, name: str) -> Any:
     return next((value for key, value in node.value if key.value == name), None)
-
-
-_NUMBERS = ("measured", "accepted", "bound")
 
 
 def _table(figures: list[_Figure]) -> Table:
@@ -285,28 +278,27 @@ def _table(figures: list[_Figure]) -> Table:
     )
     rows = []
     failed = {figure["case"] for figure in figures if figure["problem"]}
-    figures = sorted(figures, key=lambda one: (one["case"] not in failed, not one["problem"]))
-    for case, own in group_by(figures, lambda figure: figure["case"]).items():
+    figures = sorted(figures, key=lambda f: (f["case"] not in failed, not f["problem"]))
+    for case, case_figures in group_by(figures, lambda figure: figure["case"]).items():
         rows.append(Row((case,), kind="heading"))
-        for figure in own:
-            measured, accepted, bound = (figure[key] for key in _NUMBERS)
+        for figure in case_figures:
+            measured, bound, accepted = (figure[key] for key in ("measured", "bound", "accepted"))
             verdict = "falls short" if figure["problem"] else "kept"
             if measured is not None and bound is None:
                 verdict = "new"
             elif measured is not None and abs(measured) < 2.0 * abs(accepted) - bound:
                 verdict = "better"
-            three = (measured, bound, accepted)
-            shown, *limits = ["-" if n is None else _rounded(n) for n in three]
+            numbers = (measured, bound, accepted)
+            text, *limits = ["-" if number is None else _figure_text(number) for number in numbers]
             change = _change(measured, accepted)
-            ends = figure["interval"]
-            interval = f"{_rounded(ends[0])}, {_rounded(ends[1])}" if ends else "-"
-            rows.append(Row((figure["metric"], verdict, shown, change, *limits, interval)))
+            interval = ", ".join(map(_figure_text, figure["interval"] or ())) or "-"
+            rows.append(Row((figure["metric"], verdict, text, change, *limits, interval)))
     title = "short rollouts against what was accepted"
     return Table(heads, tuple(rows), title=title, caption="--update accepts what is better.")
 
 
 def _change(measured: float | None, accepted: float | None) -> str:
-    """Change of a figure's size against what was accepted, in per cent; a dash without one."""
+    """Return the change of a figure's absolute value [%]; a dash without an accepted figure."""
     if measured is None or not accepted:
         return "-"
     return f"{100.0 * (abs(measured) / abs(accepted) - 1.0):+.1f} %"

@@ -1,4 +1,4 @@
-"""The command `elastic`, and what it does when something fails."""
+"""The command `elastic`: its options, and its messages and exit codes after failures."""
 
 import ast
 import contextlib
@@ -23,58 +23,58 @@ from rich.text import Text
 import elastic_env
 from elastic_env.core.config_problems import ModelError
 from elastic_env.core.errors import shorten
-from train.runs.annotations import annotation, in_workflow
-from train.runs.console import PlainConsole, traceback_of, visible_warnings
-from train.runs.failures import DEFECT, EndedError, explain
-from train.runs.import_path import leave
-from train.runs.progress import say_what_is_compiled
+from train.runs.annotations import annotation, runs_in_workflow
+from train.runs.console import PlainConsole, traceback_text, visible_warnings
+from train.runs.failures import DEFECT, SignalError, explain
+from train.runs.import_path import remove_from_path
+from train.runs.progress import announce_compilation
 
 COMMANDS = (
     "identify evaluate compare train iterate export bench speed margins play view robot hardware"
     " lerobot hub demo"
 )
-"""Modules of this folder, each with a class of its name: options, and `run` with a console."""
+"""Modules of this folder, each with a class of that name: its fields are options, `run` works."""
 
 CONSOLE = PlainConsole()
-"""The console on which the commands say what they do."""
+"""The console of the commands."""
 
 
-def _print_last(said: str, error: BaseException, before: str = "") -> None:
-    """Say how the program ends, with the notes that its error got on the way."""
+_REPEAT_S = 2.0
+"""Time after a signal in which further signals do not interrupt the end of the program."""
+
+
+def _print_end(message: str, error: BaseException, prefix: str = "") -> None:
+    """Print why the program ends, with the notes of its error."""
     notes = getattr(error, "__notes__", [])
-    text = "; ".join([said.removesuffix(".") if notes else said, *notes])
-    PlainConsole(stderr=True).print(Text.assemble((before, "bold red"), text))
+    text = "; ".join([message.removesuffix(".") if notes else message, *notes])
+    PlainConsole(stderr=True).print(Text.assemble((prefix, "bold red"), text))
 
 
 def _print_failure(error: Exception) -> int:
-    """Say what failed; the exit code."""
-    found = explain(error)
-    if found is None:
-        sys.stderr.write(traceback_of(error))
+    """Print the message of a failure, and return its exit code."""
+    explanation = explain(error)
+    if explanation is None:
+        sys.stderr.write(traceback_text(error))
         kind = type(error).__name__
-        found = f"this is a defect of elastic-env, please report it: {kind}", DEFECT
-    said, code = found
-    _print_last(said, error, "error: ")
-    if in_workflow():
-        CONSOLE.print(annotation(said))
+        explanation = f"this is a defect of elastic-env, please report it: {kind}", DEFECT
+    message, code = explanation
+    _print_end(message, error, "error: ")
+    if runs_in_workflow():
+        CONSOLE.print(annotation(message))
     return code
 
 
-_SAME_WISH_S = 2.0
-"""How long a further signal does not interrupt what the first one asked for."""
-
-
 @contextlib.contextmanager
-def _ended_by(*numbers: int) -> Iterator[None]:
-    """Turn signals that would end this program into an exception within; ignored ones stay so."""
-    asked_s = -math.inf
+def _raise_signals(*numbers: int) -> Iterator[None]:
+    """Raise signals that would end this program as exceptions; ignored signals stay ignored."""
+    last_s = -math.inf
 
     def end(number: int, _: Any) -> None:
-        nonlocal asked_s
-        now = time.monotonic()
-        if now - asked_s > _SAME_WISH_S:
-            asked_s = now
-            raise EndedError(number)
+        nonlocal last_s
+        now_s = time.monotonic()
+        if now_s - last_s > _REPEAT_S:
+            last_s = now_s
+            raise SignalError(number)
 
     handled = {}
     is_main = threading.current_thread() is threading.main_thread()
@@ -91,18 +91,18 @@ def _ended_by(*numbers: int) -> Iterator[None]:
 
 
 def parse(arguments: list[str]) -> Any:
-    """The command that arguments name, with its options.
+    """Return the command that arguments name, with its options.
 
     Raises:
-        ConfigurationError: An option is not what it has to be.
-        SystemExit: Help was asked for, or an option does not exist.
+        ConfigurationError: The value of an option is invalid.
+        SystemExit: The user asked for help, or an option does not exist.
     """
     if arguments == ["--version"]:
         print(f"elastic-env {elastic_env.__version__}")
         sys.exit()
     short = [shorten(argument).replace("\n", " ") for argument in arguments]
     if short != arguments:
-        _parse(short)  # what is wrong with them is said without a flood
+        _parse(short)  # if it fails, its message is short
     return _parse(arguments)
 
 
@@ -113,45 +113,41 @@ def _parse(arguments: list[str]) -> Any:
     from train.commands.options import name_options
 
     name = arguments[0]
-    module = importlib.import_module(f"train.commands.{name}")
-    options = getattr(module, name.capitalize())
+    options = getattr(importlib.import_module(f"train.commands.{name}"), name.capitalize())
 
-    def command(given: Any) -> Any:
-        return given
+    def command(values: Any) -> Any:
+        return values
 
     command.__doc__ = options.__doc__
-    # without a name of its own, what is wrong with an option is an error of this program, and no
-    # box of tyro's
-    command.__annotations__["given"] = Annotated[options, tyro.conf.arg(name="")]
-    said = io.StringIO()
+    # with an empty name, a wrong option raises an error of this program instead of tyro's box
+    command.__annotations__["values"] = Annotated[options, tyro.conf.arg(name="")]
+    messages = io.StringIO()
     try:
-        with name_options(), contextlib.redirect_stderr(said):
+        with name_options(), contextlib.redirect_stderr(messages):
             return tyro.cli(command, prog=f"elastic {name}", args=arguments[1:], config=_STYLE)
-    except SystemExit as ended:
-        # what is wrong with a group of options ends in a box of tyro's, in the words of Python
-        problem = ended.__context__ and ended.__context__.__context__
+    except SystemExit as end:
+        # tyro turns a wrong group of options into a box with the words of Python
+        problem = end.__context__ and end.__context__.__context__
         if isinstance(problem, ModelError):
-            said = io.StringIO()
+            messages = io.StringIO()
             with name_options():
                 raise problem from None
         raise
     finally:
-        sys.stderr.write(said.getvalue())
+        sys.stderr.write(messages.getvalue())
 
 
 _STYLE = (tyro.conf.OmitSubcommandPrefixes, tyro.conf.OmitArgPrefixes)
 
 
 def _parse_overview(arguments: list[str]) -> Any:
-    """Print the help of all commands, which are not loaded for it, or refuse an unknown command."""
+    """Print the help of all commands without loading them, or refuse an unknown command."""
     members: Any = []
     for name in COMMANDS.split():
-        described = {"__doc__": _help_of(name)}
-        kind = dataclasses.make_dataclass(name, [], namespace=described)
+        kind = dataclasses.make_dataclass(name, [], namespace={"__doc__": _help_of(name)})
         members.append(Annotated[kind, tyro.conf.subcommand(name)])
     union = functools.reduce(operator.or_, members)
-    cli = functools.partial(tyro.cli, description=_OVERVIEW, config=_STYLE)
-    return cli(union, prog="elastic", args=arguments)
+    return tyro.cli(union, prog="elastic", description=_OVERVIEW, args=arguments, config=_STYLE)
 
 
 _OVERVIEW = (
@@ -161,7 +157,7 @@ _OVERVIEW = (
 
 
 def _help_of(name: str) -> str | None:
-    """The docstring of a command, from its source."""
+    """Return the docstring of a command from its source."""
     source = Path(__file__).with_name(f"{name}.py").read_text(encoding="utf-8")
     for node in ast.parse(source).body:
         if isinstance(node, ast.ClassDef) and node.name == name.capitalize():
@@ -170,34 +166,34 @@ def _help_of(name: str) -> str | None:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """The command `elastic`."""
+    """Run the command `elastic`."""
 
     def work() -> None:
         command = parse(sys.argv[1:] if arguments is None else arguments)
-        with say_what_is_compiled(CONSOLE), visible_warnings():
+        with announce_compilation(CONSOLE), visible_warnings():
             command.run(CONSOLE)
 
     run_program(work)
 
 
 def run_program(work: Callable[[], None]) -> None:
-    """Do the work of a program; say what fails, and end the program with its exit code.
+    """Do the work of a program; print a failure, and end the program with its exit code.
 
     Raises:
-        SystemExit: Something failed, and it was said.
-        BrokenPipeError: Nobody reads what the program says.
+        SystemExit: The work failed, and the message was printed.
+        BrokenPipeError: The reader of the output has ended.
     """
-    with _ended_by(signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+    with _raise_signals(signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         try:
-            leave(Path.cwd())
+            remove_from_path(Path.cwd())
             work()
         except BrokenPipeError:
-            raise  # nobody reads any more: not worth a word
+            raise  # nobody would read a message
         except Exception as error:
             sys.exit(_print_failure(error))
         except KeyboardInterrupt as error:
-            number = error.args[0] if isinstance(error, EndedError) else signal.SIGINT
-            said = f"ended by {signal.Signals(number).name}"
-            _print_last("interrupted" if number == signal.SIGINT else said, error)
+            number = error.args[0] if isinstance(error, SignalError) else signal.SIGINT
+            message = f"ended by {signal.Signals(number).name}"
+            _print_end("interrupted" if number == signal.SIGINT else message, error)
             # worker processes must not keep the terminal waiting
             os._exit(128 + number)

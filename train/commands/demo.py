@@ -13,20 +13,18 @@ from baselines.identification.identify import Identification, identify_points
 from baselines.policies import is_saved
 from elastic_env.core.config import Model
 from train.cells.play import run_conditions
-from train.commands.compare import CompareConfig
+from train.commands.compare_config import CompareConfig
 from train.evaluate.conditions import PolicySpec
-from train.evaluate.episodes import Evaluation, group_by
+from train.evaluate.episodes import Evaluation
 from train.evaluate.rollout import make_vector_env
 from train.figures import comparison_figures, plots
-from train.figures.chart import time_chart
 from train.figures.colours import policy_colours
 from train.figures.identification_plots import draw_identification
 from train.report import summary
 from train.report.page import TEXTS, Page
 from train.report.report_text import capital
-from train.report.specs import page_chart
-from train.report.table_formats import Table
-from train.report.write import require_libraries, write_page
+from train.report.tables import Table
+from train.report.write import add_time_chart, require_libraries, write_page
 from train.runs.console import make_table, print_files
 from train.runs.folders import run_folder
 
@@ -37,7 +35,7 @@ PAPER_PELVIS = {"uncompensated": "about 40", "input_output": "below 10"}
 def _part(
     reference: Any, *names: str, scenario: str = "nominal", **env_options: Any
 ) -> CompareConfig:
-    """A motion, with some policies, of which a saved one is called residual."""
+    """Return a comparison of policies in one motion; the label of a saved policy is residual."""
     labels = {name: "residual" if is_saved(name) else None for name in names}
     return CompareConfig(
         name="demo",
@@ -54,8 +52,7 @@ _PARTS = [
     _part("sine", "uncompensated", "input", "dynamic", "oracle", "residual:testbed/seed_0"),
     _part({"step_period": 24, "num_steps": 2}, "uncompensated", "input_output"),
     _part(3, "uncompensated", "input_output", "input_wrench"),
-    # the pitch of the start is that of the uncompensated robot, as long as policies ramp in and
-    # learn of the softness
+    # while policies ramp in and learn the softness, the pitch is that of the uncompensated robot
     _part(
         3,
         "input_output",
@@ -69,7 +66,7 @@ _PARTS = [
 
 Cells = Sequence[Evaluation]
 Rows = list[tuple[str, str, str]]
-"""Quantity, its figure here and in the paper."""
+"""Quantities, with the figures of this program and of the paper."""
 
 
 class Demo(Model):
@@ -81,14 +78,14 @@ class Demo(Model):
     """Of the figures: pdf and svg have no resolution, and png has 300 dpi."""
 
     def run(self, console: Console) -> None:
-        """Run, print the tables beside the paper's figures, and say where the pictures are."""
+        """Play the parts, and print and write tables with the paper's figures, and pictures."""
         plots.require_matplotlib()
         require_libraries()
         parts = [config.conditions() for config in _PARTS]
         conditions = list(chain(*parts))
-        recorded = {"conditions": [own.model_dump(mode="json") for own in conditions]}
+        recorded = {"conditions": [cell.model_dump(mode="json") for cell in conditions]}
         with run_folder("demo", recorded, 0, self.output) as folder:
-            console.print(_PLAYED)
+            console.print(_INTRODUCTION)
             evaluations = iter(run_conditions(conditions, console))
             played = [list(islice(evaluations, len(part))) for part in parts]
             static, motion, *walked = played
@@ -99,31 +96,31 @@ class Demo(Model):
             assert points is not None
             result = identify_points(points, [make_gravity(model)])
             result.save(folder / "identification.json")
-            known = static[0].condition.environment
+            curves = static[0].condition.environment.curves
             names = ("fig5_identification", "fig6_static_errors", "sine")
             fig5, fig6, sine = (folder / f"{name}.{self.figure_format}" for name in names)
             files = [
                 draw_identification(result, points, [model], fig5),
                 comparison_figures.draw_static_errors(static, model, fig6),
-                comparison_figures.draw_picture("time", known.curves, motion, sine),
+                comparison_figures.draw_picture("time", curves, motion, sine),
             ]
             for walk in comparison_figures.cells_together(walks):
                 files += comparison_figures.draw_signals(walk, folder, self.figure_format)
-            page = _report(_testbed_rows(result, static), files[:2], motion, walks)
+            testbed_rows = _testbed_rows(result, static)
             files += [
-                *write_page(page, folder),
+                *write_page(_report(testbed_rows, files[:2], motion, walks), folder),
                 folder / "identification.json",
                 summary.write_episodes(scored, folder / "episodes.csv"),
                 summary.write_summary(scored, folder / "summary.md"),
             ]
-        console.print(make_table(_TESTBED, _HEAD, _testbed_rows(result, static)), "")
+        console.print(make_table(_TESTBED, _HEAD, testbed_rows), "")
         summary.print_summary(motion, console)
         console.print("", make_table(_WALKS, _HEAD, _walk_rows(walks)), "")
         summary.print_summary(walks, console)
         print_files(folder, files, console)
 
 
-_PLAYED = (
+_INTRODUCTION = (
     "Robots of the paper, simulated (scenario nominal): one joint with servo, elastic gear and a"
     " pendulum of 60 N·m, and a humanoid that walks in place on twelve of them; at the end with"
     " joints that are softer than assumed (scenario soft), where the first step settles and is not"
@@ -134,11 +131,11 @@ _TESTBED = "the paper's testbed experiments, Figs. 5 and 6"
 _WALKS = "the paper's walks, Figs. 7 and 8: largest roll and pitch"
 
 
-def _report(found: Rows, pictures: Sequence[Path], motion: Cells, walks: Cells) -> Page:
-    """The tables of the demonstration, and its curves, which can be zoomed."""
-    page = Page("Demonstration", f"{_PLAYED}.")
+def _report(testbed_rows: Rows, pictures: Sequence[Path], motion: Cells, walks: Cells) -> Page:
+    """Return a page with the tables of the demonstration, and with curves that can be zoomed."""
+    page = Page("Demonstration", f"{_INTRODUCTION}.")
     page.section("One joint, at rest")
-    page.add("table", Table.plain(_HEAD, found))
+    page.add("table", Table.plain(_HEAD, testbed_rows))
     for picture in pictures:
         page.add("picture", picture, picture.stem.replace("_", " "))
     page.section("One joint, in motion", TEXTS["curves"])
@@ -150,30 +147,27 @@ def _report(found: Rows, pictures: Sequence[Path], motion: Cells, walks: Cells) 
 
 
 def _add_cells(page: Page, evaluations: Cells) -> None:
-    """Scores of some cells, and the curves of each."""
-    known = evaluations[0].condition.environment
-    page.add("table", summary.summary_table(evaluations, known.columns))
-    for own in comparison_figures.cells_together(evaluations):
-        first = own[0].condition
-        policies = group_by(own, lambda e: e.condition.policy.title)
-        chart = time_chart(policies, known.curves, policy_colours(list(policies)), _POINTS)
-        title = capital(f"{known.title(first.reference_name)}, {first.scenario}")
-        page.add("chart", page_chart(chart), title)
+    """Add the scores of some cells, and a chart for each motion and scenario."""
+    columns = evaluations[0].condition.environment.columns
+    page.add("table", summary.summary_table(evaluations, columns))
+    for cells in comparison_figures.cells_together(evaluations):
+        policies = dict.fromkeys(cell.condition.policy.title for cell in cells)
+        add_time_chart(page, cells, policy_colours(list(policies)), _MAX_POINTS)
 
 
-_POINTS = 1500
-"""Points of a curve on the page, at most."""
+_MAX_POINTS = 1500
+"""Largest number of points of a curve on the page."""
 
 
 def _testbed_rows(result: Identification, static: Cells) -> Rows:
+    """Return the rows of Figs. 5 and 6."""
     stiffness = f"{result.stiffness_nm_per_rad:.1f}"
     interval = f"{result.stiffness_low_nm_per_rad:.1f} to {result.stiffness_high_nm_per_rad:.1f}"
-    line = f"{result.line_stiffness_nm_per_rad:.1f}"
     rows = [
         ("true stiffness of the plant [N·m/rad]", "1001", "-"),
         ("identified stiffness [N·m/rad]", stiffness, "1001"),
         ("  95 % interval", interval, "-"),
-        ("  plain line", line, "1001"),
+        ("  plain line", f"{result.line_stiffness_nm_per_rad:.1f}", "1001"),
         ("friction [N·m]", f"{result.friction_nm:.2f}", "-"),
         ("Pearson r", f"{result.pearson_r:.4f}", "0.9775"),
     ]
@@ -186,6 +180,7 @@ def _testbed_rows(result: Identification, static: Cells) -> Rows:
 
 
 def _walk_rows(walks: Cells) -> Rows:
+    """Return the rows of Figs. 7 and 8."""
     rows = []
     for walk in walks:
         condition = walk.condition
@@ -193,13 +188,13 @@ def _walk_rows(walks: Cells) -> Rows:
         scenario = "" if is_paper else f", {condition.scenario}"
         if condition.env_options.get("gait", {}).get("settling_steps"):
             scenario += " from the second step on"
-        walked = condition.environment.title(condition.reference_name) + scenario
+        motion = condition.environment.title(condition.reference_name) + scenario
         peaks = [
             f"{1e3 * np.max(walk.values(f'pelvis_{axis}_peak_rad')):.1f}"
             for axis in ("roll", "pitch")
             if not walk.num_failed
         ]
         paper = PAPER_PELVIS.get(condition.policy.title, "-") if is_paper else "-"
-        name = f"{walked}, {condition.policy.title} [mrad]"
+        name = f"{motion}, {condition.policy.title} [mrad]"
         rows.append((name, " and ".join(peaks) or "fell", paper))
     return rows

@@ -1,4 +1,4 @@
-"""A program around its modules: what ends it while they load, and output that nobody takes."""
+"""Entry point of the program: interrupts while modules load, and output that nobody reads."""
 
 import contextlib
 import os
@@ -9,9 +9,10 @@ from pathlib import Path
 
 from train.runs import failures
 from train.runs.escaping import visible
-from train.runs.import_path import ShadowedError, leave, safe_children
+from train.runs.import_path import ShadowedError, isolate_children, remove_from_path
 
-_UNREAD = 128 + signal.SIGPIPE
+_PIPE_CLOSED = 128 + signal.SIGPIPE
+"""Exit code if nobody reads the output."""
 
 
 def main() -> None:
@@ -26,16 +27,16 @@ def main() -> None:
 
 
 def start(run: Callable[[], None]) -> None:
-    """Run a program, which ends with exit code 141 where nobody reads what it says.
+    """Run a program; if nobody reads its output, it ends with exit code 141.
 
     Args:
-        run: The program. What it imports itself does not come from the working folder.
+        run: The program. Its imports do not come from the working folder.
     """
-    _have_streams()
+    _open_streams()
     try:
         try:
             _leave_working_folder()  # before anything else is imported
-            with safe_children():
+            with isolate_children():
                 run()
         finally:
             sys.stdout.flush()
@@ -43,8 +44,8 @@ def start(run: Callable[[], None]) -> None:
         sys.stderr.write(f"error: {error}\n")
         sys.exit(failures.WRONG_INPUT)
     except SystemExit as error:
-        # the console of rich ends the program with 1 by itself
-        if failures.is_unread(error):
+        # the console of rich raises SystemExit(1) at a closed pipe
+        if failures.is_closed_pipe(error):
             _end_without_output(BrokenPipeError())
         raise
     except (KeyboardInterrupt, ImportError) as error:
@@ -57,39 +58,39 @@ def start(run: Callable[[], None]) -> None:
 
 
 def _leave_working_folder() -> None:
-    """Import nothing from the working folder, here and in the processes that are started."""
-    leave(Path.cwd())
+    """Import nothing from the working folder, here and in child processes."""
+    remove_from_path(Path.cwd())
     from elastic_env.hardware.safety.processes import child_environment
 
-    kept = child_environment()
-    if "PYTHONPATH" not in kept:
+    variables = child_environment()
+    if "PYTHONPATH" not in variables:
         os.environ.pop("PYTHONPATH", None)
-    os.environ.update(kept)
-    # else Numba's configuration in the working folder could name a cache, and Numba unpickles it
+    os.environ.update(variables)
+    # otherwise Numba's configuration in the working folder could name a cache, which is unpickled
     os.environ.setdefault("NUMBA_CACHE_DIR", "")
 
 
-def _have_streams() -> None:
-    """Open standard streams where the program began without them: libraries ask what they are."""
+def _open_streams() -> None:
+    """Open missing standard streams, since libraries use them."""
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         if getattr(sys, name) is None:
-            nowhere = os.open(os.devnull, os.O_RDWR)
-            setattr(sys, name, os.fdopen(nowhere, "w" if number else "r"))
+            null = os.open(os.devnull, os.O_RDWR)
+            setattr(sys, name, os.fdopen(null, "w" if number else "r"))
 
 
 def _end_without_output(error: OSError) -> None:
-    """End where nobody reads, or where the disk is full, which is said if it can be."""
+    """End the program at a closed pipe, or at a full disk, which is printed if possible."""
     is_closed = isinstance(error, BrokenPipeError)
     if not is_closed:
-        said, _ = failures.explain(error) or (str(error), failures.SYSTEM_FAILED)
+        message, _ = failures.explain(error) or (str(error), failures.SYSTEM_FAILED)
         with contextlib.suppress(OSError):
-            sys.stderr.write(visible(f"error: {said}\n"))
+            sys.stderr.write(visible(f"error: {message}\n"))
             sys.stderr.flush()
-    # what is left to write goes nowhere, at the interpreter's end too
-    nowhere = os.open(os.devnull, os.O_WRONLY)
+    # the interpreter flushes the remaining output at its end
+    null = os.open(os.devnull, os.O_WRONLY)
     for stream in (1, 2):
-        os.dup2(nowhere, stream)
-    sys.exit(_UNREAD if is_closed else failures.SYSTEM_FAILED)
+        os.dup2(null, stream)
+    sys.exit(_PIPE_CLOSED if is_closed else failures.SYSTEM_FAILED)
 
 
 if __name__ == "__main__":

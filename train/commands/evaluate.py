@@ -5,7 +5,8 @@ from pathlib import Path
 from rich.console import Console
 
 from elastic_env.core.config import Model
-from train.commands.compare import CompareConfig, compare
+from train.commands.compare_config import CompareConfig
+from train.commands.comparison import compare
 from train.commands.options import MotionOrDefault, OnHardware, Stiffness, name_options
 from train.evaluate.conditions import NumEpisodes, PolicySpec, Seed
 from train.figures.plots import FigureFormat
@@ -22,7 +23,7 @@ class Evaluate(Model):
     """
 
     policy: str = "input"
-    """Baseline, residual:PATH, or "FILE.py:function" or "module:function" for one's own.
+    """Baseline, residual:PATH, or "FILE.py:function" or "module:function" for your own.
     Baselines (see Policies in the docs) are
     zero, uncompensated, input, dynamic, link_encoder,
     disturbance_observer, iterative, oracle; on a fixed
@@ -49,7 +50,7 @@ class Evaluate(Model):
     seed: Seed = 0
     """Seed of the first episode."""
     sensors: tuple[str, ...] = ()
-    """Further sensors of the environment, which a policy of one's own reads: joint_torque,
+    """Further sensors of the environment, for a policy of your own: joint_torque,
     link_encoder, ..."""
     stiffness: Stiffness = None
     """K that the policy assumes: a number [N·m/rad], a list of one per joint
@@ -61,15 +62,15 @@ class Evaluate(Model):
     on: OnHardware = OnHardware()
 
     def run(self, console: Console) -> None:
-        """Play a comparison of one cell."""
+        """Run a comparison of one cell."""
         options = {} if self.stiffness is None else {"stiffness": self.stiffness}
-        observed = {"sensors": list(self.sensors)} if self.sensors else {}
+        sensors = {"sensors": list(self.sensors)} if self.sensors else {}
         motion = {} if self.reference is None else {"references": [self.reference]}
         with name_options(references="reference", scenarios="scenario", policies="policy"):
             config = CompareConfig(
                 name="evaluate",
                 scenarios=[self.on.scenario(self.scenario)],
-                policies=[PolicySpec(name=self.policy, options=options, env_options=observed)],
+                policies=[PolicySpec(name=self.policy, options=options, env_options=sensors)],
                 episodes=self.episodes,
                 seed=self.seed,
                 **motion,

@@ -19,24 +19,24 @@ from train.commands.options import StiffnessOrFile, given_options
 from train.export.c_arm import c_header
 from train.export.c_text import c_example, prefix_of, require_prefix
 
-_OF_WALKER = ("input_output", "adaptive_posture")
-"""Policies of a walker that are there in C."""
-_OF_ARMS = ["joints", "order", "position_gain", "limit_rad", "ramp_s", "period_s", "friction"]
+_WALKER_POLICIES = ("input_output", "adaptive_posture")
+"""Policies of a walker that can be exported to C."""
+_ARM_OPTIONS = ["joints", "order", "position_gain", "limit_rad", "ramp_s", "period_s", "friction"]
 
 
 class Output(Model):
-    """Where an exported file goes."""
+    """Options for the file of an export."""
 
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
     """File to write; default the name of what is exported, in the working folder."""
     overwrite: bool = False
-    """Replace files that are there."""
+    """Replace existing files."""
 
     def write(self, files: Mapping[Path, str | bytes], console: Console) -> None:
-        """Write files, the first one into a folder that is there.
+        """Write files; the folder of the first one must exist.
 
         Raises:
-            ResultsExistError: One is there, and is not to be replaced; nothing is written.
+            ResultsExistError: A file exists and must not be replaced; nothing is written.
             ConfigurationError: The folder does not exist.
         """
         folder = next(iter(files)).parent
@@ -56,10 +56,10 @@ class Output(Model):
 class C(Output):
     """A header in C99, without a heap: an arm's compensator, a walker's, a residual's network.
 
-    Of an arm it gives what `PositionCompensator` does: command, link_angle, torque, payload, ramp,
-    limits and friction. Call begin(&arm) once, then command(&arm, q, q_dot, q_ddot, out). The first
-    lines say units, signs, version and digests. The macro PREFIX_TEST adds a test vector, see
-    docs/export.md.
+    The header of an arm has the functions of `PositionCompensator`: command, link_angle, torque,
+    payload, ramp, limits and friction. Call begin(&arm) once, then command(&arm, q, q_dot, q_ddot,
+    out). Its first lines give units, signs, version and digests. The macro PREFIX_TEST adds a test
+    vector, see docs/export.md.
 
     Example: elastic export c arm.urdf --joints joints.yaml -o arm.h
 
@@ -80,40 +80,40 @@ class C(Output):
     all hinges [N·m/rad].
     """
     order: list[Title] = []
-    """Joints that are commanded, in the order of the arrays; default all that are not held, in
-    the order of the model.
+    """Commanded joints, in the order of the arrays; default all joints that are not held, in the
+    order of the model.
     """
     position_gain: float | None = None
-    """k_p of servos that give way under a load [N·m/rad], one for all; default what the file of
-    joints says.
+    """k_p of servos that give way under a load [N·m/rad], one for all; default the value in the
+    file of joints.
     """
     limit_rad: float = quantity("rad", 0.2, gt=0)
     """Largest offset between command and desired angle [rad]."""
     ramp_s: float = quantity("s", 0.0, ge=0)
-    """Time in which offsets grow from zero, and in which a payload is taken over [s]."""
+    """Time in which offsets grow from zero, and in which a payload takes effect [s]."""
     period_s: float = quantity("s", 0.01, gt=0)
     """Time between two commands [s]."""
     friction: bool | None = None
-    """Whether dry friction is compensated; default where any of it grows with the load."""
+    """Compensate dry friction; default only if some of it grows with the load."""
     prefix: str | None = None
-    """Begin of all names in the header; default the name of the model's file or the residual."""
+    """Prefix of all names in the header; default the name of the model's file or the residual."""
     env: Locator | None = None
-    """Environment of a residual or of a walker's policy, as of elastic export onnx."""
+    """Environment of a residual or of a walker's policy, as in elastic export onnx."""
     example: bool = False
-    """Write a folder PREFIX_example beside the header: a program that checks it against Python and
-    times it, and its CMakeLists.txt.
+    """Write a folder PREFIX_example next to the header: a program that checks the header against
+    Python and times it, and its CMakeLists.txt.
     """
 
     def run(self, console: Console) -> None:
-        """Export."""
+        """Write the header, and the example if it is wanted."""
         program = "arm"
         name = Path(self.model).stem
         if self.model.startswith(RESIDUAL):
             program = "residual"
             name = _short_name(self.model)
-        elif self.model in _OF_WALKER:
+        elif self.model in _WALKER_POLICIES:
             program = name = "walker"
-        if unused := given_options(self, ["env"] if program == "arm" else _OF_ARMS):
+        if unused := given_options(self, ["env"] if program == "arm" else _ARM_OPTIONS):
             raise ConfigurationError(
                 f"{', '.join(unused)}: without effect on {shorten(self.model)}; leave it out"
             )
@@ -128,14 +128,14 @@ class C(Output):
         self.write(files, console)
 
     def _residual(self, prefix: str) -> str:
-        """Header of a residual."""
+        """Return the header of a residual."""
         from train.export.c_residual import c_residual
         from train.export.residual_layout import ResidualLayout
 
         return c_residual(ResidualLayout.of(self.model, self.env), prefix)
 
     def _walker(self, prefix: str) -> str:
-        """Header of a walker's policy."""
+        """Return the header of a walker's policy."""
         from train.evaluate.conditions import Condition, PolicySpec
         from train.evaluate.rollout import make_vector_env
         from train.export.c_walker import c_walker
@@ -145,7 +145,7 @@ class C(Output):
             return c_walker(baselines.make(self.model, worlds), prefix)
 
     def _arm(self, prefix: str) -> str:
-        """Header of an arm."""
+        """Return the header of an arm."""
         if not is_file(self.model):
             raise ConfigurationError(
                 f"no model at {name_of(self.model)}; give a file of MJCF (.xml) or URDF (.urdf)"
@@ -165,18 +165,18 @@ class C(Output):
             period_s=self.period_s,
             friction=self.friction,
         )
-        named = [self.model, *([self.joints] if isinstance(self.joints, str) else [])]
-        sources = {Path(name).name: read_bytes(Path(name)) for name in named}
+        files = [self.model, *([self.joints] if isinstance(self.joints, str) else [])]
+        sources = {Path(file).name: read_bytes(Path(file)) for file in files}
         return c_header(compensator, prefix, sources)
 
 
 class Onnx(Output):
     """A residual as one graph of ONNX, with normalisation, mirror and bounds, and a test vector.
 
-    The input `features` has a column for each feature of the residual. Metadata of the file say
-    their names and units, the columns of the output, periods, version and digest. The file beside
-    it, .npz, has inputs and what Python makes of them. docs/export.md says what the program around
-    it has to do.
+    The input `features` has a column for each feature of the residual. The metadata of the file
+    contain their names and units, the columns of the output, periods, version and digest. A second
+    file, .npz, has inputs and the outputs of Python. docs/export.md describes the program that
+    calls the graph.
 
     Example: elastic export onnx residual:testbed/seed_0 -o testbed.onnx
 
@@ -187,33 +187,32 @@ class Onnx(Output):
     residual: Annotated[Locator, tyro.conf.Positional]
     """residual:PATH, a folder or the name of a residual that comes with the package."""
     env: Locator | None = None
-    """Environment that it is for, ROBOT.yaml or FILE.py:ROBOT; default the one of the package that
-    the residual names.
+    """Environment of the residual, ROBOT.yaml or FILE.py:ROBOT; default the environment of the
+    package that the residual names.
     """
 
     def run(self, console: Console) -> None:
-        """Export."""
+        """Write the graph and its test vector."""
         from train.export.onnx_residual import onnx_model, played_vector
         from train.export.residual_layout import ResidualLayout
 
         layout = ResidualLayout.of(self.residual, self.env)
         output = self.output or Path(f"{_short_name(self.residual)}.onnx")
         if output.suffix != ".onnx":
-            problem = f"a graph of ONNX is a file .onnx, got {shorten(output)}"
-            raise ConfigurationError(problem)
-        vector = {output.with_suffix(".npz"): played_vector(layout)}
-        self.write({output: onnx_model(layout), **vector}, console)
+            raise ConfigurationError(f"a graph of ONNX is a file .onnx, got {shorten(output)}")
+        vector = output.with_suffix(".npz")
+        self.write({output: onnx_model(layout), vector: played_vector(layout)}, console)
 
 
 def _short_name(residual: str) -> str:
-    """A name from the last two folders of a residual, such as testbed_seed_0."""
+    """Return a name from the last two folders of a residual, such as testbed_seed_0."""
     return prefix_of("_".join(Path(residual.partition(":")[2]).parts[-2:]))
 
 
 class Sb3(Model):
     """Turn a model of Stable-Baselines3 into a residual folder, which plays without torch.
 
-    Loading that folder runs no code.
+    Loading the folder runs no code.
 
     Example: elastic export sb3 model.zip train_walker_3s --normaliser normaliser.pkl
         --trust-pickle
@@ -226,21 +225,21 @@ class Sb3(Model):
     normaliser: Path | None = None
     """File of VecNormalize.save(); leave it out where observations were not normalised."""
     trust_pickle: bool = False
-    """SB3 keeps models as pickles: loading one runs code from it."""
+    """Load the model although it is a pickle, which can run code."""
     output: Path | None = None
     """Folder for the residual, new or empty; default runs/<name of the zip>, numbered if taken."""
 
     def run(self, console: Console) -> None:
-        """Export."""
+        """Write the residual folder."""
         # these need torch, the other exports do not
         from elastic_env.core.config import load_yaml
         from train.learn.export import export_zip
         from train.learn.train_config import TrainConfig
-        from train.runs.folders import own_folder
+        from train.runs.folders import result_folder
         from train.runs.presets import find_configuration
 
         config = load_yaml(find_configuration(self.config, "training"), TrainConfig)
-        with own_folder(self.model.stem, self.output) as folder:
+        with result_folder(self.model.stem, self.output) as folder:
             export_zip(self.model, config, folder, self.normaliser, self.trust_pickle)
         console.print(f"play it as residual:{folder}")
 
@@ -255,5 +254,5 @@ class Export(Model):
     command: C | Onnx | Sb3
 
     def run(self, console: Console) -> None:
-        """Do what was asked for."""
+        """Run the subcommand."""
         self.command.run(console)

@@ -1,4 +1,4 @@
-"""Held-out errors of an identification from poses, and how they are printed."""
+"""Held-out errors of an identification from poses, and their printing."""
 
 from functools import partial
 
@@ -15,12 +15,12 @@ from train.runs.progress import show_progress
 def judge_poses(
     judged: HoldoutProblem, options: HoldoutOptions, console: Console, seed: int
 ) -> HeldOut | None:
-    """Held-out errors; None where nothing is held out, which is said.
+    """Return held-out errors; if nothing is held out, print the reason and return None.
 
     Args:
         judged: Poses, and ways to predict them.
         options: Share or folds.
-        console: Where progress goes, and why nothing is held out.
+        console: Console for progress, and for the reason.
         seed: Seed of the draw.
     """
     if not options.holdout:
@@ -38,44 +38,44 @@ def judge_poses(
         return None
 
 
-def show_held_out(held_out: HeldOut, console: Console) -> None:
-    """Print the verdict, all errors, and how they fall with the number of poses."""
+def print_held_out(held_out: HeldOut, console: Console) -> None:
+    """Print the verdict, all errors, and errors by the number of poses."""
     console.print(verdict(held_out))
     rows = []
     for error in held_out.errors:
         figures = (error.rms, error.mean, error.worst)
-        rows.append([error.name, *(_text(figure, held_out) for figure in figures)])
+        rows.append([error.name, *(_figure_text(figure, held_out) for figure in figures)])
     title = f"error of {held_out.of} at {held_out.held_out} poses that were held out"
     head = ["prediction", f"rms [{held_out.unit}]", "mean", "worst"]
     console.print(make_table(title, head, rows, box=box.SIMPLE))
     points = [
-        f"{point.poses} poses {_text(point.rms, held_out)} {held_out.unit}"
+        f"{point.poses} poses {_figure_text(point.rms, held_out)} {held_out.unit}"
         for point in held_out.curve
     ]
     console.print(f"by the number of poses: {', '.join(points)}")
 
 
 def verdict(held_out: HeldOut) -> str:
-    """Held-out errors in a sentence; a rival that is ahead comes first."""
-    rigid = _text(held_out.errors[0].rms, held_out)
-    own = _text(held_out.errors[-1].rms, held_out)
+    """Return held-out errors in a sentence; a rival that is ahead comes first."""
+    rigid = _figure_text(held_out.errors[0].rms, held_out)
+    identified = _figure_text(held_out.errors[-1].rms, held_out)
     rival = held_out.best_rival
-    best = f"{_text(rival.rms, held_out)} {held_out.unit}"
+    best = f"{_figure_text(rival.rms, held_out)} {held_out.unit}"
     if held_out.is_ahead:
         return (
-            f"held out: {rigid} {held_out.unit} rms as given, {own} {held_out.unit} identified;"
-            f" the best of the rest, {rival.name}, reaches {best}"
+            f"held out: {rigid} {held_out.unit} rms as given, {identified} {held_out.unit}"
+            f" identified; the best of the rest, {rival.name}, reaches {best}"
         )
     return (
-        f"{rival.name} is ahead: {best} rms at held-out poses, where the identification has {own}"
-        f" {held_out.unit}: use that, or log more poses"
+        f"{rival.name} is ahead: {best} rms at held-out poses, where the identification has"
+        f" {identified} {held_out.unit}: use that, or log more poses"
     )
 
 
 def number_or_dash(value: float | None, form: str = ".4g", scale: float = 1.0) -> str:
-    """A figure in a table; – where there is none."""
+    """Return a figure for a table; – for None."""
     return "–" if value is None else format(scale * value, form)
 
 
-def _text(value: float, held_out: HeldOut) -> str:
+def _figure_text(value: float, held_out: HeldOut) -> str:
     return f"{value:.3f}" if held_out.unit == "N·m" else f"{value:.2f}"

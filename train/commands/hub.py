@@ -1,4 +1,4 @@
-"""`elastic hub`: residuals to the Hugging Face hub and back."""
+"""`elastic hub`: push residuals to the Hugging Face hub, and pull them."""
 
 from pathlib import Path
 from typing import Annotated
@@ -15,20 +15,20 @@ from train.export.hub import pull_residual, push_residual
 class Push(Model):
     """Put a residual's folder into a repository of the hub: description, weights and a card.
 
-    Log in before by: hf auth login
+    First log in with: hf auth login
 
     Example: elastic hub push residual:testbed/seed_0 me/testbed-residual
     """
 
     residual: Annotated[Locator, tyro.conf.Positional]
-    """Its folder, or residual:NAME of one that comes with the package."""
+    """Folder of the residual, or residual:NAME of one in the package."""
     repository: Annotated[Title, tyro.conf.Positional]
-    """OWNER/NAME; a repository that is not there is made."""
+    """OWNER/NAME; a missing repository is created."""
     public: bool = False
-    """Let everybody read a new repository; default its owner alone."""
+    """Let everybody read a new repository; default only its owner."""
 
     def run(self, console: Console) -> None:
-        """Push."""
+        """Push the residual, and print its address and digest."""
         folder = Path(self.residual.removeprefix(RESIDUAL))
         pushed = push_residual(folder, self.repository, self.public)
         console.print(f"wrote {pushed.url}")
@@ -38,8 +38,8 @@ class Push(Model):
 class Pull(Model):
     """Take a residual from a repository of the hub.
 
-    Sizes and kinds of files are checked before they are fetched, and the digest of the weights
-    after. Nothing of it runs as code.
+    Sizes and kinds of files are checked before they are fetched, the digest of the weights
+    afterwards. No file runs as code.
 
     Example: elastic hub pull me/testbed-residual
 
@@ -53,12 +53,12 @@ class Pull(Model):
     sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")] | None = None
     """Digest that the weights must have, as elastic hub push prints it."""
     offline: bool = False
-    """Ask no server: take what was pulled before from the hub's cache."""
+    """Contact no server; use the hub's cache of earlier pulls."""
     output: Path | None = None
     """Folder for the residual, new or empty; default hub/OWNER/NAME."""
 
     def run(self, console: Console) -> None:
-        """Pull."""
+        """Pull the residual, and print its commit and folder."""
         pulled = pull_residual(
             self.repository,
             revision=self.revision,
@@ -79,5 +79,5 @@ class Hub(Model):
     command: Push | Pull
 
     def run(self, console: Console) -> None:
-        """Do what was asked for."""
+        """Run the subcommand."""
         self.command.run(console)

@@ -22,7 +22,7 @@ from baselines.identification.servo_result import ServoIdentification
 from elastic_env.core.errors import ConfigurationError, quote
 from elastic_env.joint.model_file import compiled_model
 from train.commands.arm_problem import ArmProblem
-from train.commands.held_out import judge_poses, show_held_out
+from train.commands.held_out import judge_poses, print_held_out
 from train.commands.identify_arm_tables import remarks, result_table
 from train.commands.identify_geometry import identify_geometry
 from train.commands.identify_options import ArmOptions, IdentificationRun, ServoOptions
@@ -86,7 +86,7 @@ def identify_arm(options: ArmOptions, run: IdentificationRun, console: Console) 
         if plan is not None:
             files.append(write_plan(problem.arm, plan, folder))
     if result.held_out is not None:
-        show_held_out(result.held_out, console)
+        print_held_out(result.held_out, console)
     console.print(result_table(result))
     written = [f"wrote {path}" for path in files]
     for line in (residual_summary(fit), *remarks(result), *written):

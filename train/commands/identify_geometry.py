@@ -22,7 +22,7 @@ from elastic_env.joint.model_file import read_model
 from elastic_env.joint.model_joints import held_positions
 from elastic_env.rigid.tree.end_effector import site_or_body
 from elastic_env.rigid.tree.links import Tree
-from train.commands.held_out import judge_poses, number_or_dash, show_held_out
+from train.commands.held_out import judge_poses, number_or_dash, print_held_out
 from train.commands.identify_options import ArmOptions, GeometryOptions, IdentificationRun
 from train.figures.identification_plots import draw_geometry
 from train.runs.console import make_table
@@ -113,7 +113,7 @@ def _axial_torques(log: PoseLog) -> AxialTorques | None:
 def show_result(result: GeometryIdentification, console: Console) -> None:
     """Print held-out errors, stiffness, and parameters that the poses do not determine."""
     if result.held_out is not None:
-        show_held_out(result.held_out, console)
+        print_held_out(result.held_out, console)
     rows = []
     friction = {
         parameter.name: parameter.value if parameter.is_told else None

@@ -25,7 +25,7 @@ from train.evaluate.rollout import make_policy, make_vector_env
 from train.evaluate.table import over_cells
 from train.figures import plots
 from train.figures.chart import trials_chart
-from train.report.table_formats import number_interval
+from train.report.tables import number_interval
 from train.runs.console import make_table
 from train.runs.escaping import write_records
 from train.runs.folders import provenance, run_folder

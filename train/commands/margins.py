@@ -1,4 +1,4 @@
-"""`elastic margins`: the largest push, slope and load, and the softest joints, of a walk."""
+"""`elastic margins`: the largest push, slope and load, and the softest joints, without a fall."""
 
 import itertools
 import json
@@ -11,23 +11,17 @@ from rich.console import Console
 
 from elastic_env.core.config import LARGEST_SEED, Entries, Locator, Model, Once, Title, quantity
 from elastic_env.core.files import write_whole
-from train.commands.compare import try_out
+from train.commands.comparison import try_out
 from train.commands.options import MotionOrDefault
 from train.evaluate.conditions import Condition, PolicySpec
-from train.evaluate.margins import (
-    QUANTITIES,
-    Causes,
-    failure_causes,
-    find_margins,
-    margin_table,
-)
+from train.evaluate.margins import QUANTITIES, Causes, failure_causes, find_margins, margin_table
 from train.evaluate.rollout import num_steps
 from train.runs.console import make_table, print_files
 from train.runs.escaping import write_records
 from train.runs.folders import run_folder
 from train.runs.progress import show_progress
 
-_MOST_ROBOTS = 64
+_MAX_ROBOTS = 64
 
 Field = Literal["push_n", "stiffness", "slope_rad", "load_kg", "floor_friction"]
 
@@ -35,12 +29,12 @@ Field = Literal["push_n", "stiffness", "slope_rad", "load_kg", "floor_friction"]
 class Margins(Model):
     """Find how far a walk is from a fall: by bisection, for each of several robots.
 
-    Sought are the largest push, slope and load, the softest joints and the least friction of the
-    floor. Prints the edge of the robot that fails first, and the median of the robots. A star:
-    beyond its edge that robot does not stand before any policy acts.
+    It searches the largest push, slope and load, the softest joints and the least friction of the
+    floor. It prints the edge of the robot that fails first, and the median over robots. A star
+    means: beyond its edge that robot does not stand even before a policy acts.
 
-    Whether a robot survives need not be monotone; bisection finds one edge. So all robots walk once
-    more at 0.9 of the way to the edge of the first.
+    Survival need not be monotone, and bisection finds one edge. So all robots walk once more at 0.9
+    of the way to the first robot's edge.
 
     Example, one policy: elastic margins --policies input_output --robots 4 --quantities push_n
     """
@@ -55,14 +49,14 @@ class Margins(Model):
     quantities: Entries[Field] = list(get_args(Field))
     """Fields of the scenario that are varied, one at a time."""
     scenario: Title = "spread"
-    """Scenario of the robots, without ranges such as those of drawn."""
+    """Scenario of the robots; not one with ranges, such as drawn."""
     reference: MotionOrDefault = 3
     """Walk, as in elastic evaluate."""
-    robots: int = quantity("1", 8, ge=1, le=_MOST_ROBOTS)
+    robots: int = quantity("1", 8, ge=1, le=_MAX_ROBOTS)
     """Robots; their seeds follow --seed."""
     halvings: int = quantity("1", 7, ge=1, le=30)
-    """How often each interval is halved; a walk of all robots each."""
-    seed: int = quantity("1", 0, ge=0, le=LARGEST_SEED - _MOST_ROBOTS)
+    """Halvings of each interval; each is a walk of all robots."""
+    seed: int = quantity("1", 0, ge=0, le=LARGEST_SEED - _MAX_ROBOTS)
     """Seed of the first robot."""
     threads: int = quantity("1", 0, ge=0, le=1024)
     """Threads of the physics, 0 for all cores."""
@@ -71,8 +65,8 @@ class Margins(Model):
     taken."""
 
     def run(self, console: Console) -> None:
-        """Bisect policy by policy, and write the margins after each of them."""
-        chosen = [own for own in QUANTITIES if own.field in self.quantities]
+        """Bisect for each policy, and write the margins after each."""
+        chosen = [quantity for quantity in QUANTITIES if quantity.field in self.quantities]
         conditions = [
             Condition(
                 env="walker",
@@ -85,18 +79,19 @@ class Margins(Model):
         ]
         try_out(conditions)
         steps = num_steps(conditions)
-        rounds = self.halvings + 1
-        totals = {name: rounds * own for name, own in zip(self.policies, steps, strict=True)}
+        totals = {
+            name: (self.halvings + 1) * n for name, n in zip(self.policies, steps, strict=True)
+        }
         recorded = self.model_dump(mode="json", exclude={"output", "threads"})
         records: list[dict[str, Any]] = []
         with run_folder("margins", recorded, self.seed, self.output) as folder:
             files = [folder / "margins.csv", folder / "margins.json"]
             with show_progress(console, totals, unit="control steps") as show:
                 for number, condition in enumerate(conditions):
-                    before = itertools.count(0, steps[number])
-                    play = partial(self._play, before, partial(show, number))
+                    starts = itertools.count(0, steps[number])
+                    play = partial(self._play, starts, partial(show, number))
                     records += find_margins(condition, chosen, self.robots, self.halvings, play)
-                    rows = [{k: v for k, v in own.items() if k != "edges"} for own in records]
+                    rows = [{k: v for k, v in row.items() if k != "edges"} for row in records]
                     write_records(rows, files[0])
                     write_whole(files[1], json.dumps(records, indent=2) + "\n")
         title = f"worst / median edge of {self.robots} robots, {conditions[0].reference_name}"
@@ -104,7 +99,8 @@ class Margins(Model):
         print_files(folder, files, console)
 
     def _play(
-        self, before: Iterator[int], show: Callable[[int], None], conditions: Sequence[Condition]
+        self, starts: Iterator[int], show: Callable[[int], None], conditions: Sequence[Condition]
     ) -> Causes:
-        begun = next(before)
-        return failure_causes(conditions, self.threads, lambda done: show(begun + done))
+        """Play a walk of all robots, whose progress begins at the next of the starts."""
+        start = next(starts)
+        return failure_causes(conditions, self.threads, lambda done: show(start + done))

@@ -1,4 +1,4 @@
-"""Options that several commands share, and how the text of an option becomes a value."""
+"""Options that several commands share, and conversion of their texts to values."""
 
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
@@ -20,7 +20,7 @@ from train.evaluate.conditions import GivenReference
 from train.evaluate.environments import environment
 
 DEFAULT_SCENARIO = "nominal"
-"""Scenario of a simulation where none is named."""
+"""Scenario of a simulation, if the user names none."""
 
 _TEXT = PrimitiveConstructorSpec(
     nargs=1,
@@ -55,9 +55,9 @@ def _read_stiffness(text: Any) -> Any:
 
 
 Motion = Annotated[GivenReference, BeforeValidator(_read_reference), _TEXT]
-"""A reference: a name, a number, durations or a mapping, or one of these as text in YAML."""
+"""A reference: a name, a number, durations or a mapping, or one of these as YAML text."""
 MotionOrDefault = Annotated[Any, BeforeValidator(_read_reference), _TEXT]
-"""The same, which the cell checks that is made of it; or None, for the environment's default."""
+"""A reference that its cell checks; or None, for the environment's default."""
 Stiffness = Annotated[Any, BeforeValidator(_read_stiffness), _TEXT]
 """A stiffness: a number, a list of numbers, one of these as text, or the path of a file."""
 StiffnessOrFile = Annotated[Locator | float | None, BeforeValidator(_read_stiffness), _TEXT]
@@ -65,10 +65,11 @@ StiffnessOrFile = Annotated[Locator | float | None, BeforeValidator(_read_stiffn
 
 
 _PATIENT_IMU_S = 0.2
+"""Oldest accepted attitude with `--patient` [s]."""
 
 
 class Mounting(HardwareSettings):
-    """Content of the file of `--mounting`: wiring and mounting of the testbed, and its pendulum."""
+    """The file of `--mounting`: wiring and mounting of the testbed, and its pendulum."""
 
     pendulum: Pendulum = Pendulum()
 
@@ -77,7 +78,7 @@ class OnHardware(Model):
     """Options of commands that run on the simulated testbed, or with --port on a real one."""
 
     port: str | None = None
-    """Port of a real servo, such as /dev/ttyUSB0, in place of the simulation."""
+    """Port of a real servo, such as /dev/ttyUSB0, instead of the simulation."""
     imu_port: str | None = None
     """Port of the IMU on its link."""
     mounting: Path | None = None
@@ -85,41 +86,41 @@ class OnHardware(Model):
     yes: bool = False
     """Begin to move without asking."""
     patient: bool = False
-    """Bear ten missing replies in a row, 90 ms without a command and attitudes 0.2 s old: for
-    emulators, whose pseudo-terminals stall where the computer is busy."""
+    """Tolerate ten missing replies in a row, 90 ms without a command and attitudes 0.2 s old: for
+    emulators, whose pseudo-terminals stall while the computer is busy."""
 
     @cached_property
     def arguments(self) -> dict[str, Any]:
         """Arguments of `elastic_env/HardwareTestbed-v0`; empty for the simulation.
 
         Raises:
-            ConfigurationError: There are options of hardware, but no port.
+            ConfigurationError: Options for hardware are given without a port.
         """
         if self.port is None and self.mounting is None:
             for name in ("imu_port", "yes", "patient"):
                 if getattr(self, name):
-                    wanted = "is for a real testbed: name its servo's port too, with --port"
-                    raise ConfigurationError(f"{_option(name)} {wanted}")
+                    cure = "name its servo's port too, with --port"
+                    raise ConfigurationError(f"{_option(name)} is for a real testbed: {cure}")
             return {}
         confirm = False if self.yes else None
         options = {"port": self.port, "imu_port": self.imu_port, "confirm": confirm}
         given = {name: value for name, value in options.items() if value is not None}
         if self.mounting is None:
-            chosen = Mounting(**given)
+            mounting = Mounting(**given)
         else:
-            chosen = load_yaml(self.mounting, Mounting, given)
-        named = {*chosen.model_fields_set, *options, "limits"}
-        values = chosen.model_dump(include=named)
+            mounting = load_yaml(self.mounting, Mounting, given)
+        names = {*mounting.model_fields_set, *options, "limits"}
+        values = mounting.model_dump(include=names)
         if self.patient:
             values["limits"] |= PATIENT_LIMITS
-            values["imu_oldest_s"] = max(chosen.imu_oldest_s, _PATIENT_IMU_S)
+            values["imu_oldest_s"] = max(mounting.imu_oldest_s, _PATIENT_IMU_S)
         return values
 
     def environment(self, env: str) -> dict[str, Any]:
-        """The environment of a comparison: the named one, or a real testbed with its arguments.
+        """Return the environment of a comparison: the named one, or a real testbed and arguments.
 
         Raises:
-            ConfigurationError: The named one is not there on hardware.
+            ConfigurationError: The named environment does not exist on hardware.
         """
         if not (arguments := self.arguments):
             return {"env": env}
@@ -130,7 +131,7 @@ class OnHardware(Model):
         return {"env": real, "env_options": arguments}
 
     def scenario(self, named: str | None) -> str:
-        """The named scenario, or the default; on hardware the word for it in tables.
+        """Return the named scenario, or the default; on hardware the label in tables.
 
         Raises:
             ConfigurationError: A scenario is named for hardware.
@@ -138,29 +139,29 @@ class OnHardware(Model):
         if not self.arguments:
             return DEFAULT_SCENARIO if named is None else named
         if named is not None:
-            problem = f"scenario {named!r} is of a simulation, hardware is what it is"
+            problem = f"scenario {named!r} is for a simulation, not for hardware"
             raise ConfigurationError(f"{problem}: leave --scenario out, or --port")
         return "hardware"
 
 
 def given_options(options: Model, names: Iterable[str]) -> list[str]:
-    """Options that differ from their defaults, as they are spelt."""
+    """Return the options that differ from their defaults, as users write them."""
     fields = type(options).model_fields
-    given = [name for name in names if getattr(options, name) != fields[name].default]
-    return list(map(_option, given))
+    return [_option(name) for name in names if getattr(options, name) != fields[name].default]
 
 
 @contextmanager
-def name_options(**of_one: str) -> Iterator[None]:
-    """Let errors of a configuration that is made from options name the options.
+def name_options(**list_options: str) -> Iterator[None]:
+    """Name the options in errors of a configuration that is made from options.
 
     Args:
-        **of_one: Options that give a list of the configuration its only entry, by its name.
+        **list_options: Options that set the only entry of a list, by the list's name in the
+            configuration.
     """
 
     def spelt(path: ParameterPath) -> str:
         name = str(path[0]) if path else ""
-        return _option(of_one.get(name, name)) if path else ""
+        return _option(list_options.get(name, name)) if path else ""
 
     try:
         yield
@@ -169,5 +170,5 @@ def name_options(**of_one: str) -> Iterator[None]:
 
 
 def _option(name: str) -> str:
-    """A field as the option that sets it."""
+    """Return the option that sets a field."""
     return f"--{name.replace('_', '-')}"

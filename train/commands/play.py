@@ -35,8 +35,8 @@ def play(
     """Play one episode in a window in real time, or into a video file as fast as it goes.
 
     Args:
-        condition: What to play.
-        console: Where messages go.
+        condition: Cell to play.
+        console: Console for messages.
         video: File to write (mp4 or gif); None opens a window.
         max_s: Stop after this much simulated time [s], one control step at least.
 
@@ -45,8 +45,7 @@ def play(
         MissingExtraError: The video writer is not installed.
     """
     mode = "human" if video is None else "rgb_array"
-    name = condition.environment.id
-    env: Any = gymnasium.make(name, render_mode=mode, **condition.arguments)
+    env: Any = gymnasium.make(condition.environment.id, render_mode=mode, **condition.arguments)
     task = env.unwrapped.task
     period = task.assumed_model.control_period_s
     with closing(env):
@@ -56,7 +55,7 @@ def play(
             _rehearse(policy, condition, console)
         played = episode(env, policy, condition, steps, console)
         if video is None:
-            _window(played, period)
+            _play_in_real_time(played, period)
         else:
             with show_progress(console, {"filming": steps}, transient=True, unit="film") as show:
                 _film(env, played, period, video, show)
@@ -64,36 +63,35 @@ def play(
 
 
 def steps_within(task: Any, max_s: float | None) -> int:
-    """Control steps of an episode that is shown, at least one.
+    """Return the number of control steps of a shown episode, at least one.
 
     Args:
-        task: Of the environment.
+        task: Task of the environment.
         max_s: Stop after this much simulated time [s]; None for the whole episode.
     """
     if max_s is None:
         return task.num_steps
-    steps = max_s / task.assumed_model.control_period_s
-    return max(round(min(steps, task.num_steps)), 1)
+    return max(round(min(max_s / task.assumed_model.control_period_s, task.num_steps)), 1)
 
 
 def _rehearse(policy: Any, condition: Condition, console: Console) -> None:
-    """Let a policy learn on the robot, out of sight."""
+    """Let a policy learn on the robot, before the window opens or the film begins."""
     console.print(f"{condition.policy.title} learns on this robot first")
-    with closing(make_vector_env(condition, 1)) as unseen:
-        policy.rehearse(unseen, condition.seed)
+    with closing(make_vector_env(condition, 1)) as env:
+        policy.rehearse(env, condition.seed)
 
 
 def episode(
     env: Any, policy: Any, condition: Condition, steps: int, console: Console
 ) -> Iterator[_Step]:
-    """Play step by step; yields number and info of each step, and says so where the episode fails.
+    """Play step by step; yield number and info of each step, and print why the episode ended early.
 
     Args:
-        env: One world.
-        policy: What commands it.
-        condition: What is played, for its seed and for errors.
-        steps: Number of steps at most.
-        console: Where messages go.
+        env: Environment of one world.
+        policy: Policy that commands it.
+        condition: Cell that is played, for its seed and for errors.
+        steps: Largest number of steps.
+        console: Console for messages.
     """
     for step in islice(control_steps(env, policy, condition.seed, condition), steps):
         yield step.number, step.info
@@ -102,7 +100,7 @@ def episode(
             console.print(f"the episode ended {when}: {step.info['termination']}")
 
 
-def _window(episode: Iterable[_Step], period: float) -> None:
+def _play_in_real_time(episode: Iterable[_Step], period: float) -> None:
     begin = time.perf_counter()
     for step, _ in episode:
         time.sleep(max(0.0, begin + (step + 1) * period - time.perf_counter()))
@@ -122,8 +120,7 @@ def _film(env: Any, episode: Iterable[_Step], period: float, video: Path, show: 
     frame_s = every * period
     frames = 0
     video.parent.mkdir(parents=True, exist_ok=True)
-    # a GIF is made in memory in any case, and its writer would print what a full disk makes it
-    # raise
+    # a GIF is made in memory, since its writer prints the error of a full disk
     memory = io.BytesIO()
     is_gif = video.suffix == ".gif"
     if is_gif:
@@ -142,33 +139,33 @@ def _film(env: Any, episode: Iterable[_Step], period: float, video: Path, show: 
         else:
             _require_whole(video, frames)
     except BaseException:
-        video.unlink(missing_ok=True)  # what is not whole would stand in the way of the next one
+        video.unlink(missing_ok=True)  # an existing file is never overwritten
         raise
 
 
 def _require_whole(video: Path, frames: int) -> None:
-    """Check that a film has its frames: the encoder is a process whose failure nobody is told.
+    """Check that a film has all frames, since the encoder is a process that reports no failure.
 
     Raises:
-        SystemFailedError: It has others, or cannot be read.
+        SystemFailedError: Frames are missing, or the file cannot be read.
     """
     from imageio_ffmpeg import count_frames_and_secs
 
     try:
-        found, _ = count_frames_and_secs(str(video))
+        readable, _ = count_frames_and_secs(str(video))
     except RuntimeError:
-        found = 0
-    if found != frames:
-        problem = f"{video} is not whole, {found} of {frames} frames can be read"
+        readable = 0
+    if readable != frames:
+        problem = f"{video} is not whole, {readable} of {frames} frames can be read"
         cure = "the disk may be full: free some space, then play again"
         raise SystemFailedError(f"{problem}; {cure}")
 
 
 class WatchedEpisode(Model):
-    """Options of an episode that somebody watches."""
+    """Options of an episode that the user watches."""
 
     policy: str = "uncompensated"
-    """Baseline, residual:PATH, or "FILE.py:function" for one's own; see elastic evaluate --help."""
+    """Baseline, residual:PATH, or "FILE.py:function" for your own; see elastic evaluate --help."""
     env: str = "testbed"
     """Environment: testbed, walker, robot, ROBOT.yaml (a file of any robot, see docs/robots.md),
     or "FILE.py:ROBOT", a JointRobot."""
@@ -206,5 +203,5 @@ class Play(WatchedEpisode):
     """Video file to write (.mp4, .gif); without it a window opens."""
 
     def run(self, console: Console) -> None:
-        """Play."""
+        """Play the episode."""
         play(self.condition, console, self.video, self.max_s)

@@ -24,7 +24,8 @@ from elastic_env.joint.model_text import is_text, name_of, without_declaration
 from elastic_env.motion.arm_references import Poses
 from elastic_env.robots.gallery import GALLERY, gallery_file, gallery_joints, gallery_robot
 from elastic_env.robots.robot.environment import configure_robot
-from train.commands.compare import CompareConfig, compare
+from train.commands.compare_config import CompareConfig
+from train.commands.comparison import compare
 from train.commands.options import Motion, StiffnessOrFile
 from train.commands.play import play
 from train.commands.robot_at_rest import TABLE_STYLE, joint_shares, picture, shares_table

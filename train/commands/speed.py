@@ -14,13 +14,14 @@ import numpy as np
 from pydantic import Field
 from rich.console import Console
 
-import train.speed.contenders as loops
 from elastic_env.core.config import Entries, Model, quantity
 from train.evaluate.environments import environment
 from train.runs.console import make_table
 from train.runs.escaping import write_records
 from train.runs.folders import run_folder
 from train.runs.progress import plain_progress
+from train.speed.contenders import Contender, RawWorlds, ScalarLoop, VectorLoop
+from train.speed.foreign_loops import IN_PROCESSES, IN_THIS_PROCESS, ForeignLoop, PPOLoop
 from train.speed.real_time import PERCENTILES, play_against_the_clock
 
 _PPO_PROCESSES = 2
@@ -29,18 +30,18 @@ _PPO_PROCESSES = 2
 class Speed(Model):
     """Measure throughput against raw mj_step on the same model, in one interleaved run.
 
-    Timed are the vector environment, without and with a policy and a residual network in its loop;
-    scalar environments, under the vector environments of Gymnasium and SB3 too; and PPO end to end.
+    It times the vector environment, without and with a policy and a residual network in its loop;
+    scalar environments, also in the vector environments of Gymnasium and SB3; and PPO end to end.
 
     Example, the vector environment alone: elastic speed --env testbed --num-envs 64 1024
         --no-others --no-ppo
 
-    With --backend warp the physics of the vector environment runs on a GPU, still against raw
-    mj_step on the CPU. Example: elastic speed --backend warp --num-envs 4096 16384
+    With --backend warp the physics of the vector environment runs on a GPU, and raw mj_step still
+    on the CPU. Example: elastic speed --backend warp --num-envs 4096 16384
         --policy input_output --no-others --no-ppo
 
-    With --real-time one policy is timed alone, as on a robot: it is called with recorded
-    observations, once in every control period. Printed are late cycles and latencies. Example:
+    With --real-time only one policy is timed, as on a robot: it is called with recorded
+    observations, once in every control period. The output is late cycles and latencies. Example:
     elastic speed --real-time --policy dynamic
     """
 
@@ -54,11 +55,11 @@ class Speed(Model):
     others: bool = True
     """Time scalar environments too, alone and in vector environments of Gymnasium and SB3."""
     processes: Entries[Annotated[int, Field(ge=1, le=1024)]] = [2, 4]
-    """Numbers of processes to try with them."""
+    """Numbers of processes to try with these vector environments."""
     ppo: bool = True
     """Time PPO end to end too."""
     profile: bool = False
-    """Say where the time of the vector environment with its policy goes."""
+    """Profile the vector environment with its policy."""
     steps: int = quantity("1", 50, ge=1, le=100_000)
     """Control steps per round."""
     rounds: int = quantity("1", 7, ge=1, le=1000)
@@ -71,11 +72,11 @@ class Speed(Model):
     device: str | None = None
     """Device of --backend warp; default cuda:0."""
     real_time: bool = False
-    """Time a policy alone against the clock, in place of all that; reads env, policy, seconds
-    and output alone.
+    """Time only a policy, called at the control rate; of the other options env, policy, seconds and
+    output apply.
     """
     seconds: float = quantity("s", 60.0, gt=0, le=86_400)
-    """How long, with --real-time [s]."""
+    """Duration with --real-time [s]."""
     output: Path | None = None
     """Folder for speed.json and speed.csv, or real_time.json, new or empty; default runs/speed,
     numbered if taken.
@@ -83,52 +84,48 @@ class Speed(Model):
 
     @property
     def threads_used(self) -> int:
-        """Threads, one per core for 0."""
+        """Number of threads; one per core for 0."""
         return self.threads or os.cpu_count() or 1
 
     @property
     def looped_policy(self) -> str:
-        """The policy in the loop: the named one, or the environment's best that needs no truth."""
+        """Policy in the loop: the named one, or the environment's best one without ground truth."""
         return self.policy or environment(self.env).looped_policy
 
-    def vector_loop(self, num_envs: int, policy: str | None, residual: bool) -> loops.VectorLoop:
-        """The vector environment with a policy, and perhaps a network, in its loop."""
+    def vector_loop(self, num_envs: int, policy: str | None, residual: bool) -> VectorLoop:
+        """Return the loop of the vector environment with a policy, and perhaps a network."""
         threads = min(self.threads_used, num_envs)
-        where = {"backend": self.backend, "device": self.device}
-        return loops.VectorLoop(self.env, num_envs, threads, policy, residual, **where)
+        backend = {"backend": self.backend, "device": self.device}
+        return VectorLoop(self.env, num_envs, threads, policy, residual, **backend)
 
     def run(self, console: Console) -> None:
-        """Measure, print, and write what was measured."""
-        if self.real_time:
-            path = measure_real_time(self, console)
-        else:
-            path = measure_throughput(self, console)
-        console.print(f"wrote {path}")
+        """Measure, print the figures, and write them."""
+        work = measure_real_time if self.real_time else measure_throughput
+        console.print(f"wrote {work(self, console)}")
 
 
 _TIMES = {"latency": "from due to command", "policy": "in the policy"}
 
 
 def measure_real_time(config: Speed, console: Console) -> Path:
-    """Time a policy against the clock, print its latencies, and write them as JSON."""
+    """Time a policy at the control rate, print its latencies, and write them as JSON."""
     recorded = config.model_dump(mode="json", include={"env", "policy", "seconds"})
     with run_folder("speed", recorded, 0, config.output) as folder:
         length = f"{config.seconds:g} s"
         console.print(f"recording an episode, then {length} against the clock")
-        found = play_against_the_clock(config.env, config.policy, config.seconds)
+        figures = play_against_the_clock(config.env, config.policy, config.seconds)
         path = folder / "real_time.json"
-        path.write_text(json.dumps(found, indent=2) + "\n")
-    period = f"once in {found['period_us']:.0f} µs"
-    title = f"{found['policy']} on the {config.env}, {period}; times in µs"
+        path.write_text(json.dumps(figures, indent=2) + "\n")
+    period = f"once in {figures['period_us']:.0f} µs"
+    title = f"{figures['policy']} on the {config.env}, {period}; times in µs"
     rows = [
-        (label, *(f"{found[f'{key}_{name}_us']:.0f}" for name in PERCENTILES))
+        (label, *(f"{figures[f'{key}_{name}_us']:.0f}" for name in PERCENTILES))
         for key, label in _TIMES.items()
     ]
-    head = ["", "median", "99 %", "99.9 %", "longest"]
-    console.print(make_table(title, head, rows))
-    share = 100.0 * found["late_share"]
-    console.print(f"late: {found['late']} of {found['cycles']} cycles, {share:.3f} %")
-    if not found["is_real_time"]:
+    console.print(make_table(title, ["", "median", "99 %", "99.9 %", "longest"], rows))
+    share = 100.0 * figures["late_share"]
+    console.print(f"late: {figures['late']} of {figures['cycles']} cycles, {share:.3f} %")
+    if not figures["is_real_time"]:
         console.print("without real-time scheduling, to which this user has no right")
     return path
 
@@ -136,11 +133,10 @@ def measure_real_time(config: Speed, console: Console) -> Path:
 def measure_throughput(config: Speed, console: Console) -> Path:
     """Time all contenders, print their ratios, and write them as JSON and CSV."""
     if config.others or config.ppo:
-        # what is missing is said before the work
+        # so that a missing package fails before the work
         importlib.import_module("stable_baselines3")
     config.vector_loop(1, config.policy, residual=False)
-    unused = {"output", "profile", "real_time", "seconds"}
-    recorded = config.model_dump(mode="json", exclude=unused)
+    recorded = config.model_dump(mode="json", exclude={"output", "profile", "real_time", "seconds"})
     with run_folder("speed", recorded, None, config.output) as folder:
         console.print("measuring every contender in turn, round by round")
         results = measure(config, plain_progress(console))
@@ -153,10 +149,9 @@ def measure_throughput(config: Speed, console: Console) -> Path:
             console.print(text)
     title = f"{config.env}: control steps per second, medians of one interleaved run"
     rows = []
-    for one in results:
-        worlds = str(one["num_envs"])
-        figures = (f"{one['steps_per_s']:,.0f}", f"{one['ratio']:.3f}")
-        rows.append((one["contender"], worlds, *figures, one["against"]))
+    for row in results:
+        figures = (str(row["num_envs"]), f"{row['steps_per_s']:,.0f}", f"{row['ratio']:.3f}")
+        rows.append((row["contender"], *figures, row["against"]))
     table = make_table(title, ["", "worlds", "steps/s", "ratio", "to"], rows)
     table.columns[-1].justify = "left"
     console.print(table)
@@ -168,12 +163,11 @@ def measure(config: Speed, progress: Callable[[float], None]) -> list[dict[str, 
 
     Args:
         config: Options of the command.
-        progress: Called after every contender of every round with the share of the work that is
-            done.
+        progress: Takes the finished share of the work, after every contender of every round.
 
     Returns:
         For every contender the medians over the rounds: control steps per second of all its worlds,
-        and the ratio to the one that it is compared with.
+        and the ratio to its opponent.
     """
     contenders, against = _contenders(config)
     rates = np.empty((config.rounds + 1, len(contenders)))
@@ -202,14 +196,14 @@ def measure(config: Speed, progress: Callable[[float], None]) -> list[dict[str, 
     ]
 
 
-def _contenders(config: Speed) -> tuple[list[loops.Contender], list[int]]:
-    """Contenders, and for each the number of the one that it is compared with.
+def _contenders(config: Speed) -> tuple[list[Contender], list[int]]:
+    """Return contenders, and for each the number of its opponent.
 
-    The two are beside each other in turn, where that one is for it alone.
+    An opponent of one contender only comes directly before or after it.
     """
     env = config.env
     policy = config.looped_policy
-    contenders: list[loops.Contender] = []
+    contenders: list[Contender] = []
     against: list[int] = []
     for n in config.num_envs:
         threads = min(config.threads_used, n)
@@ -217,24 +211,24 @@ def _contenders(config: Speed) -> tuple[list[loops.Contender], list[int]]:
         with_policy = config.vector_loop(n, policy, residual=False)
         with_network = config.vector_loop(n, policy, residual=True)
         against += [len(contenders) + 1] * 4
-        contenders += [loop, loops.RawWorlds(loop, threads), with_policy, with_network]
+        contenders += [loop, RawWorlds(loop, threads), with_policy, with_network]
     if config.others:
-        scalar = loops.ScalarLoop(env)
+        scalar = ScalarLoop(env)
         against += [len(contenders) + 1] * 2
-        contenders += [scalar, loops.RawWorlds(scalar, 1)]
-        foreign = [(kind, n) for n in config.processes for kind in loops.IN_PROCESSES]
-        foreign += [(kind, config.processes[0]) for kind in loops.IN_THIS_PROCESS]
+        contenders += [scalar, RawWorlds(scalar, 1)]
+        foreign = [(kind, n) for n in config.processes for kind in IN_PROCESSES]
+        foreign += [(kind, config.processes[0]) for kind in IN_THIS_PROCESS]
         against += [0] * len(foreign)
-        contenders += [loops.ForeignLoop(env, kind, n) for kind, n in foreign]
+        contenders += [ForeignLoop(env, kind, n) for kind, n in foreign]
     if config.ppo:
         against += [len(contenders)] * 2
-        contenders.append(loops.PPOLoop(env, policy, 64, config.threads_used))
-        contenders.append(loops.PPOLoop(env, policy, _PPO_PROCESSES, None))
+        contenders.append(PPOLoop(env, policy, 64, config.threads_used))
+        contenders.append(PPOLoop(env, policy, _PPO_PROCESSES, None))
     return contenders, against
 
 
 def profile(config: Speed) -> str:
-    """Profile of the vector environment with its policy, as text."""
+    """Return a profile of the vector environment with its policy, as text."""
     loop = config.vector_loop(config.num_envs[0], config.looped_policy, residual=False)
     loop.run(config.steps)
     profiler = cProfile.Profile()

@@ -18,11 +18,11 @@ from train.workers.executors import Executors
 class Train(Model):
     """Train a residual on top of a base policy, for every training seed of a configuration.
 
-    Example: elastic train train_walker_3s, and if it was interrupted: elastic train
-    --resume runs/NAME. The seeds of several configurations share the workers: elastic train a.yaml
-    b.yaml --jobs 4. Each configuration has a run of its own. It keeps, for every seed, checkpoint/
-    to go on from, best/ and last/ as policies, which elastic evaluate and compare take as
-    residual:PATH, progress.csv, and files for TensorBoard.
+    Example: elastic train train_walker_3s, and to continue it: elastic train --resume runs/NAME.
+    The seeds of several configurations share the workers: elastic train a.yaml b.yaml --jobs 4.
+    Each configuration has its own run. For every seed the run has checkpoint/ to continue from,
+    best/ and last/ as policies for elastic evaluate and compare (residual:PATH), progress.csv, and
+    files for TensorBoard.
     """
 
     config: Annotated[tuple[Path, ...], tyro.conf.Positional] = ()
@@ -30,7 +30,7 @@ class Train(Model):
     list_presets: Annotated[bool, tyro.conf.arg(name="list")] = False
     """List the presets, which are the configurations of the package, and train none."""
     resume: tuple[Path, ...] = ()
-    """Folders of runs to go on with."""
+    """Folders of runs to continue."""
     seeds: list[int] | None = None
     """Training seeds instead of the configurations' own."""
     decisions: int | None = None
@@ -40,13 +40,13 @@ class Train(Model):
     numbered if taken.
     """
     trust_code: bool = False
-    """With --resume: run the code that the run's algorithm names, where it is none of
-    Stable-Baselines3's.
+    """With --resume: run the code that the run's algorithm names, if it is not from
+    Stable-Baselines3.
     """
     executors: Executors = ONE_BY_ONE
 
     def run(self, console: Console) -> None:
-        """Train, go on with it, or list the presets."""
+        """Train, continue runs, or list the presets."""
         if self.list_presets:
             print_presets("training", console)
             return
@@ -58,10 +58,9 @@ class Train(Model):
         given = {"seeds": self.seeds, "decisions": self.decisions}
         changes = {name: value for name, value in given.items() if value is not None}
         if self.resume and (changes or self.output is not None):
-            problem = (
+            raise ConfigurationError(
                 "a run goes on as it was begun: --resume takes no --seeds, --decisions or --output"
             )
-            raise ConfigurationError(problem)
         if self.resume:
             folders = resume(self.resume, console, self.executors, self.trust_code)
         else:

@@ -24,8 +24,8 @@ from elastic_env.core.errors import (
 from elastic_env.core.signals import BoolArray
 from elastic_env.world.scenario import make_scenario
 from train.evaluate.conditions import Condition, PolicySpec
-from train.runs.failures import is_full
-from train.runs.user_code import line_of_user, named_object
+from train.runs.failures import is_disk_full
+from train.runs.user_code import named_object, user_line
 
 Watch = Callable[[int, Any, Any, Any], None]
 """Sees number, observation, info and memory of a control step, before the world moves."""
@@ -135,13 +135,13 @@ def policy_errors(condition: Condition, step: int | None = None) -> Iterator[Non
     except (SystemFailedError, MemoryError):
         raise
     except (Exception, SystemExit) as error:
-        if is_full(error):
+        if is_disk_full(error):
             raise
         kind = "" if isinstance(error, ElasticError) else f"{type(error).__name__}: "
         when = "" if step is None else f", at control step {step}"
         raise PolicyFailedError(
             f"the policy {condition.policy.title!r} failed in scenario {condition.scenario!r}, "
-            f"{condition.reference_name}{when}{line_of_user(error)}: {kind}{error}"
+            f"{condition.reference_name}{when}{user_line(error)}: {kind}{error}"
         ) from error
 
 
@@ -173,7 +173,7 @@ def make_policy(spec: PolicySpec, env: Any, options: Any = None) -> Any:
     except ElasticError:
         raise
     except Exception as error:
-        place = line_of_user(error)
+        place = user_line(error)
         problem = f"{attribute}(env, ...) raised{place} {type(error).__name__}: {error}"
         raise _not_a_policy(spec, problem) from error
 

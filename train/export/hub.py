@@ -25,7 +25,7 @@ from elastic_env.core.errors import (
     shorten,
 )
 from elastic_env.core.files import read_bounded, write_whole
-from train.runs.folders import own_folder
+from train.runs.folders import result_folder
 
 HUB = Path("hub")
 """Folder of residuals that were pulled, in the working folder."""
@@ -149,7 +149,7 @@ def pull_residual(
     files = {path.name: read_bounded(path, _MOST_BYTES[path.name]) for path in paths}
     with TemporaryDirectory() as place:
         description = _checked(files, Path(place), repository, digest)
-    with own_folder("hub", HUB / repository if output is None else output) as folder:
+    with result_folder("hub", HUB / repository if output is None else output) as folder:
         for name, content in files.items():
             write_whole(folder / name, content)
     return Pulled(folder, commits.pop(), description)

@@ -20,8 +20,9 @@ from train.runs.console import make_table
 from train.runs.folders import lock_part, lock_run, require_name, run_folder
 from train.runs.progress import Show, show_progress
 from train.runs.user_code import recorded_config
-from train.workers.calls import Outcome, Watch, run_calls
+from train.workers.calls import Watch, run_calls
 from train.workers.executors import Executors
+from train.workers.pool import Outcome
 
 ONE_BY_ONE = Executors(jobs=1)
 """Seeds in turn, in this process, with all cores for the physics of each."""
@@ -142,13 +143,13 @@ def _watch(names: Sequence[str], console: Console, show: Show) -> Watch:
 
     def report(number: int, decisions: int) -> None:
         done[number] = max(done[number], decisions)
-        show(number, done[number], watch.tally.in_words("seeds"))
+        show(number, done[number], watch.tally.summary("seeds"))
 
     def move(number: int) -> None:
         text = f"a worker was lost; {names[number]} goes on from its checkpoint"
         console.print(text, soft_wrap=True)
 
-    watch = Watch(reported=report, moved=move)
+    watch = Watch(on_report=report, on_move=move)
     return watch
 
 

@@ -28,7 +28,7 @@ from train.evaluate.conditions import (
 from train.evaluate.environments import environment
 from train.learn.algorithm_options import CONSTANTS, checked_options
 from train.learn.mixed_env import mixed_env
-from train.runs.user_code import CodeNamingModel, is_a
+from train.runs.user_code import CodeNamingModel, kind_check
 
 FIRST_TRAINING_SEED = 10_000_000
 EVALUATION_SEED = 50_000
@@ -96,7 +96,7 @@ class TrainConfig(CodeNamingModel):
     A checkpoint ends all episodes: leave several of every world between two.
     """
 
-    _kind = model_validator(mode="before")(is_a("training"))
+    _kind = model_validator(mode="before")(kind_check("training"))
     _checked = field_validator("base")(require_plain_base)
 
     @model_validator(mode="after")

@@ -1,1 +1,1 @@
-"""The report of a comparison: words, charts and tables, as one HTML file and as Markdown."""
+"""The report of a comparison: texts, charts and tables, as one HTML file and as Markdown."""

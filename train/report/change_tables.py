@@ -1,4 +1,4 @@
-"""Paired changes as tables: a line per cell for the terminal, all for the report, and CSV."""
+"""Paired changes as tables for the terminal, for the report, and as CSV."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -12,50 +12,46 @@ from train.evaluate.changes import Change, by_line, percent_interval, signed_int
 from train.evaluate.episodes import group_by
 from train.evaluate.maps import HeatMap
 from train.evaluate.statistics import Estimate, named_intervals
-from train.report.table_formats import Cell, Head, Part, Row, Table, number_interval, print_table
+from train.report.tables import Cell, Head, Part, Row, Table, number_interval
+from train.report.terminal import print_table
 from train.runs.escaping import write_records
 
-_SIGNS = {
-    **{"°": terms.HELD_OUT, "(°)": terms.PARTLY},
-    **{"†": terms.CEILING, "‡": terms.SAME_ROBOT},
-}
-"""Marks by their signs, where there is little room."""
+_SIGNS = {"°": terms.HELD_OUT, "(°)": terms.PARTLY, "†": terms.CEILING, "‡": terms.SAME_ROBOT}
+"""Marks by the signs that stand for them on a terminal."""
+_MAX_LINES = 40
+"""Largest number of changes of policies without training on a terminal."""
 
 
 def print_changes(rows: Sequence[Change], console: Console) -> None:
-    """Print the changes, a line per cell: residuals against bases, against rivals, then others."""
+    """Print a line per cell: residuals against bases, residuals against rivals, then others."""
     judged = [row for row in rows if row.is_judged]
 
     def kind(row: Change) -> tuple[bool, bool, str]:
-        # residuals against each their own base share a table
+        # all residuals against their own bases share a table
         return not row.is_family, row.is_rival, "" if row.is_family else row.base
 
-    for _, own in sorted(group_by(judged, kind).items()):
-        lines = len(own) // len({row.column for row in own})
-        if own[0].is_family or lines <= _MOST_LINES:
-            print_table(cells_table(own), console, "statistics.csv")
+    for _, group in sorted(group_by(judged, kind).items()):
+        lines = len(group) // len({row.column for row in group})
+        if group[0].is_family or lines <= _MAX_LINES:
+            print_table(cells_table(group), console, "statistics.csv")
         else:
-            title = f"{lines} changes of policies without training against {own[0].base}"
+            title = f"{lines} changes of policies without training against {group[0].base}"
             console.print(f"{title}: see statistics.csv and report.md")
 
 
-_MOST_LINES = 40
-"""Changes of policies without training that a terminal shows."""
-
-
 def cells_table(rows: Sequence[Change]) -> Table:
-    """Changes against one kind of opponent, a line per cell with all metrics.
+    """Return a table of changes against one kind of opponent: a line per cell with all metrics.
 
     Args:
-        rows: Changes of one environment: of residuals, all against bases or all against rivals, or
-            of policies without training against one policy.
+        rows: Changes of one environment: residuals, all against bases or all against rivals; or
+            policies without training, all against one policy.
     """
     columns = list(dict.fromkeys(row.column for row in rows))
     swept = list(dict.fromkeys(name for row in rows for name in row.swept))
     policies = tuple(dict.fromkeys(row.policy for row in rows))
     is_one = len(policies) == 1
-    named = "residual" if rows[0].is_family else "policy"
-    names = [*([] if is_one else [named]), "reference", "scenario"]
+    kind = "residual" if rows[0].is_family else "policy"
+    names = [*([] if is_one else [kind]), "reference", "scenario"]
     words: dict[str, Any] = {"is_number": False, "wraps": True}
     heads = [Head(name, titles=name == "reference", **words) for name in names]
     heads += [Head(name.replace("_", " ")) for name in swept]
@@ -65,27 +61,26 @@ def cells_table(rows: Sequence[Change]) -> Table:
     for line in by_line(rows):
         first = line[0]
         scope = " ".join(filter(None, [first.scope, "".join(_signs(first.marks))]))
-        own = [*([] if is_one else [first.policy]), first.reference, scope]
+        labels = [*([] if is_one else [first.policy]), first.reference, scope]
         figures = [signed_interval(row.relative, row.verdict) for row in line]
-        cells = [*own, *first.first.swept_values(swept), *figures]
-        kind = "group" if first.is_group else ""
-        lines.append(Row((*cells, failed_and_base(first)), kind))
+        cells = (*labels, *first.first.swept_values(swept), *figures, _failures(first))
+        lines.append(Row(cells, "group" if first.is_group else ""))
     signs = _signs([mark for row in rows for mark in row.marks])
     return Table(
         tuple(heads),
         tuple(lines),
         keys=len(names),
-        title=f"change against {_opponent(rows)} on the same episodes, {_seeds(rows)}",
+        title=f"change against {_opponent(rows)} on the same episodes, {_statistic(rows)}",
         subjects=policies if is_one else (),
         caption=". ".join([*(f"{sign} {_SIGNS[sign]}" for sign in signs), terms.SIGNS_ARE]),
     )
 
 
 def changes_table(rows: Sequence[Change], colours: Mapping[str, str]) -> Table:
-    """All figures of paired changes, a row per cell and metric, with headings.
+    """Return a table of all figures of paired changes: a row per cell and metric, with headings.
 
     Args:
-        rows: Changes of residuals, or of policies without training seeds.
+        rows: Changes, either all of residuals, or all of policies without training seeds.
         colours: Colour of every policy.
     """
     swept = list(dict.fromkeys(name for row in rows for name in row.swept))
@@ -97,14 +92,12 @@ def changes_table(rows: Sequence[Change], colours: Mapping[str, str]) -> Table:
     heads += [Head("95 % over"), Head(f"{rows[0].failure} (base)")]
     heads += [Head("what it shows", is_number=False)] * is_family
     lines = []
-    blocks = group_by(rows, lambda row: (row.policy, row.base))
-    for (policy, base), own in blocks.items():
-        number = own[0].num_seeds
+    for (policy, base), block in group_by(rows, lambda row: (row.policy, row.base)).items():
+        number = block[0].num_seeds
         seeds = f", {number} training seed{'s' * (number != 1)}" if is_family else ""
-        title = f"{policy} against {base}{seeds}"
-        lines.append(Row((title,), kind="heading", dot=colours[policy]))
-        for row in (row for line in by_line(own) for row in line):
-            failed = Part(failed_and_base(row), "failure" if row.falls_more else "")
+        lines.append(Row((f"{policy} against {base}{seeds}",), kind="heading", dot=colours[policy]))
+        for row in (row for line in by_line(block) for row in line):
+            failed = Part(_failures(row), "failure" if row.falls_more else "")
             cells: list[Cell] = [row.reference, _scope(row)]
             cells += [*row.first.swept_values(swept), row.column.title, _means(row)]
             cells += [(Part(percent_interval(row.relative), row.verdict),)]
@@ -116,7 +109,7 @@ def changes_table(rows: Sequence[Change], colours: Mapping[str, str]) -> Table:
 
 
 def _scope(row: Change) -> tuple[Part, ...]:
-    """Scenario or group, with its marks."""
+    """Return scenario or group, with its marks."""
     parts = [Part(row.scope)]
     if row.is_group:
         parts.append(Part("pooled", "pooled", before=" "))
@@ -126,7 +119,7 @@ def _scope(row: Change) -> tuple[Part, ...]:
 
 
 def _means(row: Change) -> str:
-    """Means of base and policy in the shown unit; - where there is nothing to compare."""
+    """Return the means of base and policy in the displayed unit; "-" without a comparison."""
     column = row.column
     if not np.isfinite(row.mine):
         return "-"
@@ -135,7 +128,8 @@ def _means(row: Change) -> str:
     return f"{before} → {after} {column.unit}"
 
 
-def _seeds(rows: Sequence[Change]) -> str:
+def _statistic(rows: Sequence[Change]) -> str:
+    """Return what the figures of a table are, and what their intervals are over."""
     over = named_intervals(row.relative for row in rows) or "no interval"
     if not rows[0].is_family:
         return over
@@ -144,7 +138,7 @@ def _seeds(rows: Sequence[Change]) -> str:
 
 
 def _opponent(rows: Sequence[Change]) -> str:
-    """The policy that a table compares others with."""
+    """Return the policy with which a table compares others."""
     if not rows[0].is_family:
         return rows[0].base
     if not rows[0].is_rival:
@@ -153,29 +147,29 @@ def _opponent(rows: Sequence[Change]) -> str:
 
 
 def _signs(marks: Sequence[str]) -> list[str]:
-    """Signs of some marks, where there is little room."""
-    return [s for s, words in _SIGNS.items() if any(m.startswith(words) for m in marks)]
+    """Return the signs that stand for some marks."""
+    return [sign for sign, mark in _SIGNS.items() if any(m.startswith(mark) for m in marks)]
 
 
-def failed_and_base(row: Change) -> str:
-    """Failed episodes of all, the base's in brackets; an exclamation mark where there are more."""
+def _failures(row: Change) -> str:
+    """Return failed episodes of all, the base's in brackets, with "!" if the base has fewer."""
     mark = "! " if row.falls_more else ""
     base = f"{row.base_falls}/{row.base_episodes}"
     return f"{mark}{row.falls}/{row.episodes} ({base})"
 
 
 def write_statistics(rows: Sequence[Change], path: Path) -> Path:
-    """One row per change; metrics in SI units, changes and probabilities as shares of one."""
+    """Write a CSV row per change: metrics in SI units, changes and probabilities as shares."""
     swept = list(dict.fromkeys(name for row in rows for name in row.swept))
     return write_records([_record(row, swept) for row in rows], path)
 
 
 def _record(row: Change, swept: Sequence[str]) -> dict[str, object]:
-    of_residual = terms.BEST_ANALYTIC if row.is_rival else "base of the residual"
+    opponent = terms.BEST_ANALYTIC if row.is_rival else "base of the residual"
     return {
         "policy": row.policy,
         "base": row.base,
-        "base_is": of_residual if row.is_family else "policy to compare with",
+        "base_is": opponent if row.is_family else "policy to compare with",
         "kind": "residual" if row.is_family else "baseline",
         "reference": row.reference,
         "scope": row.scope,
@@ -200,32 +194,31 @@ def _record(row: Change, swept: Sequence[str]) -> dict[str, object]:
 
 
 def write_maps(maps: Sequence[HeatMap], path: Path) -> Path:
-    """One row per cell, metric and policy; scores in SI units, changes as shares of one."""
-    return write_records([row for found in maps for row in _map_records(found)], path)
+    """Write a CSV row per cell, metric and policy: scores in SI units, changes as shares."""
+    return write_records([row for heat_map in maps for row in _map_records(heat_map)], path)
 
 
-_AGAINST = (*Estimate(0.0).record("change"), "verdict")
-"""Columns of a map that only residuals fill."""
+_CHANGE_COLUMNS = (*Estimate(0.0).record("change"), "verdict")
+"""Columns of a map that are empty for policies without training."""
 
 
-def _map_records(found: HeatMap) -> Iterator[dict[str, object]]:
-    x_ticks, y_ticks = found.ticks
-    for y, row in zip(y_ticks, found.cells, strict=True):
+def _map_records(heat_map: HeatMap) -> Iterator[dict[str, object]]:
+    x_ticks, y_ticks = heat_map.ticks
+    for y, row in zip(y_ticks, heat_map.cells, strict=True):
         for x, cell in zip(x_ticks, row, strict=True):
             for title, estimate in cell.levels.items():
                 change = cell.learned.get(title)
-                against: dict[str, object] = dict.fromkeys(_AGAINST, "")
+                change_record: dict[str, object] = dict.fromkeys(_CHANGE_COLUMNS, "")
                 if change is not None:
-                    against = change.relative.record("change")
-                    against["verdict"] = change.verdict
+                    change_record = {**change.relative.record("change"), "verdict": change.verdict}
                 failed, episodes = cell.failed[title]
                 yield {
-                    "map": found.title,
-                    "x_is": found.axes.x.title,
+                    "map": heat_map.title,
+                    "x_is": heat_map.axes.x.title,
                     "x": x,
-                    "y_is": found.axes.y.title,
+                    "y_is": heat_map.axes.y.title,
                     "y": y,
-                    "metric": found.column.metric,
+                    "metric": heat_map.column.metric,
                     "policy": title,
                     **estimate.record("mean"),
                     "interval_over": estimate.over,
@@ -234,5 +227,5 @@ def _map_records(found: HeatMap) -> Iterator[dict[str, object]]:
                     "is_best": title == cell.best,
                     "is_best_without_learning": title == cell.best_analytic,
                     "best_without_learning": cell.best_analytic or "",
-                    **against,
+                    **change_record,
                 }

@@ -1,4 +1,4 @@
-"""Dot plots of a page: the ladder of policies, and every residual against its base."""
+"""Dot plots of a page: scores of all policies, and changes of residuals against their bases."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -13,7 +13,7 @@ from train.evaluate.table import EpisodeTable, failures, score
 from train.figures.colours import INK, LINE, VERDICTS
 from train.report import specs
 from train.report.specs import LONGEST_NAME, Spec, base_axis
-from train.report.table_formats import number_interval
+from train.report.tables import number_interval
 from train.runs.escaping import chart_text
 
 
@@ -22,12 +22,12 @@ class Dot:
     """A figure with its interval in a row of a dot plot.
 
     Attributes:
-        row: Its place, counted downwards.
-        estimate: As the axis shows it; nan where there is only a text.
-        text: Beside it, as HTML.
-        text_x: Where the text begins.
-        name: Shown under the pointer.
-        colour, symbol: Its look.
+        row: Position of the row, counted downwards.
+        estimate: Figure in the unit of the axis; nan if there is only a text.
+        text: Text next to the dot, as HTML.
+        text_x: Left end of the text, in the unit of the axis.
+        name: Text under the pointer.
+        colour, symbol: Look of the dot.
     """
 
     row: float
@@ -46,13 +46,13 @@ def _dot_plot(
     height: float,
     top: int = 40,
 ) -> Spec:
-    """Panels side by side whose rows have names, plain or as HTML.
+    """Return panels next to each other, with named rows.
 
     Args:
-        rows: Names by place.
-        panels: Axis and dots of each.
+        rows: Names of rows by position, plain or as HTML.
+        panels: Axis and dots of each panel.
         left: Margin at the left [px].
-        height: Of the chart [px].
+        height: Height of the chart [px].
         top: Margin at the top [px].
     """
     layout = specs.base_layout(left=left, top=top, bottom=10)
@@ -60,8 +60,8 @@ def _dot_plot(
     for number, (axis, dots) in enumerate(panels):
         x = f"x{specs.nth(number)}"
         known = [dot for dot in dots if dot.estimate.is_known]
-        for colour, own in group_by(known, lambda dot: dot.colour).items():
-            data.append(_points(own, colour, x))
+        for colour, group in group_by(known, lambda dot: dot.colour).items():
+            data.append(_points(group, colour, x))
         texts = {
             "type": "scatter",
             "mode": "text",
@@ -76,8 +76,12 @@ def _dot_plot(
         }
         data.append(texts)
         domain = specs.domain(number, len(panels), gap=0.03)
-        place = {"domain": domain, "anchor": "y", "side": "top"}
-        layout[f"xaxis{specs.nth(number)}"] = {**axis, **place}
+        layout[f"xaxis{specs.nth(number)}"] = {
+            **axis,
+            "domain": domain,
+            "anchor": "y",
+            "side": "top",
+        }
     layout["yaxis"] = base_axis(
         range=[max(rows, default=0.0) + 0.7, -0.7],
         tickvals=list(rows),
@@ -89,7 +93,7 @@ def _dot_plot(
 
 
 def _points(dots: Sequence[Dot], colour: str, x: str) -> Spec:
-    """Points of one colour with their intervals."""
+    """Return points of one colour with their intervals."""
     symbols = [dot.symbol for dot in dots]
     outline = {"width": 1.6, "color": colour}
     return {
@@ -106,7 +110,7 @@ def _points(dots: Sequence[Dot], colour: str, x: str) -> Spec:
 
 
 def ladder(table: EpisodeTable, reference: str, colours: Mapping[str, str]) -> Spec:
-    """Every policy in every scenario: its mean over the episodes that did not fail."""
+    """Return the chart of all policies in all scenarios: means over episodes that did not fail."""
     rungs: list[tuple[float, str, Any]] = []
     headings: dict[str, float] = {}
     place = 0.0
@@ -153,7 +157,7 @@ def ladder(table: EpisodeTable, reference: str, colours: Mapping[str, str]) -> S
 
 
 def _level_axis(column: Column, levels: Sequence[Estimate]) -> Spec:
-    """A logarithmic axis, with room for figures at its right."""
+    """Return a logarithmic axis, with room for figures at its right."""
     ends = [end for level in levels if level.is_known for end in level.ends]
     high = max(ends, default=1.0)
     low = max(min(ends, default=1.0), high / 1e4, 1e-6)
@@ -186,28 +190,26 @@ def _heading(text: str, place: float) -> Spec:
 
 
 def forest(rows: Sequence[Change]) -> Spec:
-    """Changes of one residual against its base, in every cell, with intervals."""
+    """Return the chart of changes of one residual against its base, in all cells."""
     lines = by_line(rows)
     several = len({row.reference for row in rows}) > 1
-    names = []
-    for row, *_ in lines:
-        names.append(f"{row.reference} · {row.scope}" if several else row.scope)
+    names = [f"{row.reference} · {row.scope}" if several else row.scope for row, *_ in lines]
     panels = []
-    for own in group_by(rows, lambda row: row.column).values():
-        changes = [row.relative.times(100.0) for row in own]
+    for column, metric_rows in group_by(rows, lambda row: row.column).items():
+        changes = [row.relative.times(100.0) for row in metric_rows]
         ends = [end for change in changes if change.is_known for end in change.ends]
         low = min([*ends, 0.0])
         high = max([*ends, 0.0])
         span = max(high - low, 1.0)
         axis = base_axis(
-            f"change of {own[0].column.title} [%]",
+            f"change of {column.title} [%]",
             range=[low - 0.05 * span, high + 0.5 * span],
             zeroline=True,
             zerolinecolor=INK,
             zerolinewidth=1.2,
         )
-        # texts stand in a column behind all intervals, so that the line at zero crosses none
-        panels.append((axis, [_change_dot(n, row, high) for n, row in enumerate(own)]))
+        # texts begin right of all intervals, so that the line at zero crosses none
+        panels.append((axis, [_change_dot(n, row, high) for n, row in enumerate(metric_rows)]))
     titles = [
         f"<b>{chart_text(name)}</b>" if line[0].is_group else chart_text(name)
         for name, line in zip(names, lines, strict=True)
@@ -221,7 +223,6 @@ def forest(rows: Sequence[Change]) -> Spec:
 
 
 def _change_dot(place: int, row: Change, text_x: float) -> Dot:
-    known = row.relative.is_known
     symbol = "circle"
     if CEILING in row.marks:
         symbol = "star"
@@ -230,7 +231,7 @@ def _change_dot(place: int, row: Change, text_x: float) -> Dot:
     return Dot(
         place,
         row.relative.times(100.0),
-        percent_interval(row.relative) if known else "nothing to compare",
+        percent_interval(row.relative) if row.relative.is_known else "nothing to compare",
         text_x,
         f"{row.scope}: {row.sentence}",
         VERDICTS[row.verdict],

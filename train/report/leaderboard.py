@@ -21,7 +21,8 @@ from train.evaluate.standings import Paired, Standing
 from train.evaluate.statistics import Estimate
 from train.report.page import TEXTS, Page
 from train.report.report_text import capital
-from train.report.table_formats import Head, Part, Row, Table, print_table
+from train.report.tables import Head, Part, Row, Table
+from train.report.terminal import print_table
 from train.runs.escaping import write_records
 
 COLUMNS = {
@@ -35,95 +36,91 @@ COLUMNS = {
         *("change_to_best_high", "verdict_to_best"),
     ),
 }
-"""Columns of `leaderboard.csv` by fields of a `Standing`; of the others they have the same name."""
+"""Columns of `leaderboard.csv` by fields of a `Standing`; other fields have one column each."""
 
 
-def board(found: Sequence[Standing]) -> Table:
-    """The leaderboard: groups of scenarios, and with each motion what is in no group."""
-    return _board([s for s in found if s.is_column], found)
+def leaderboard_table(standings: Sequence[Standing]) -> Table:
+    """Return the leaderboard: for each motion the groups, and scenarios that are in no group."""
+    return _table([s for s in standings if s.is_column], standings)
 
 
-def scenarios_board(found: Sequence[Standing]) -> Table | None:
-    """The single scenarios behind the groups of the first motion; None where there are none."""
-    there = [s for s in found if s.reference == found[0].reference]
-    single = [s for s in there if not s.is_group and not s.is_column]
-    return _board(single, []) if single else None
+def scenarios_table(standings: Sequence[Standing]) -> Table | None:
+    """Return the single scenarios in the groups of the first motion; None if there are none."""
+    of_motion = [s for s in standings if s.reference == standings[0].reference]
+    single = [s for s in of_motion if not s.is_group and not s.is_column]
+    return _table(single, []) if single else None
 
 
-def _board(shown: Sequence[Standing], everything: Sequence[Standing]) -> Table:
-    """A table of some standings, with the totals of all where there are any."""
+def _table(shown: Sequence[Standing], all_standings: Sequence[Standing]) -> Table:
+    """Return a table of the shown standings, with totals over all standings if there are any."""
     columns = list(dict.fromkeys((s.scope, s.reference) for s in shown))
     metrics = list(dict.fromkeys(s.metric for s in shown))
     rows = []
     for track in Track:
-        own = [s for s in shown if s.track is track]
-        if own:
+        standings = [s for s in shown if s.track is track]
+        if standings:
             rows.append(Row((str(track),), kind="heading"))
-        places = {(s.policy, s.scope, s.reference, s.metric): s for s in own}
+        places = {(s.policy, s.scope, s.reference, s.metric): s for s in standings}
         best = {}
-        entries = group_by(own, lambda s: (s.scope, s.reference, s.metric))
-        for key, some in entries.items():
-            scores = {s.policy: (s.score, (s.failed, s.episodes)) for s in some}
-            best[key] = best_of(scores)
-        order = dict.fromkeys((s.policy for s in own), math.inf)
-        for s in own:
+        for key, rivals in group_by(standings, lambda s: (s.scope, s.reference, s.metric)).items():
+            best[key] = best_of({s.policy: (s.score, (s.failed, s.episodes)) for s in rivals})
+        order = dict.fromkeys((s.policy for s in standings), math.inf)
+        for s in standings:
             if (s.scope, s.reference, s.metric) == (*columns[0], metrics[0]) and s.score.is_known:
                 order[s.policy] = s.score.value
         for policy in sorted(order, key=order.__getitem__):
             entries = []
             for column in columns:
-                found = [places.get((policy, *column, metric)) for metric in metrics]
-                entries.append(_entry([s for s in found if s is not None], best))
-            is_published = any(s.is_published for s in own if s.policy == policy)
+                figures = [places.get((policy, *column, metric)) for metric in metrics]
+                entries.append(_entry([s for s in figures if s is not None], best))
+            is_published = any(s.is_published for s in standings if s.policy == policy)
             name = f"{policy} (published)" if is_published else policy
-            rows.append(Row((name, *entries, *_totals(policy, everything))))
+            rows.append(Row((name, *entries, *_totals(policy, all_standings))))
     heads = [Head("policy", is_number=False)]
     heads += [Head(scope, second=reference, leaves=1) for scope, reference in columns]
-    heads += [Head("failed"), Head("µs")] if everything else []
-    title = f"leaderboard, {_meaning(shown)}"
+    heads += [Head("failed"), Head("µs")] if all_standings else []
+    title = f"leaderboard, {_metric_labels(shown)}"
     return Table(tuple(heads), tuple(rows), title=title, kind="board")
 
 
-def _meaning(shown: Sequence[Standing]) -> str:
-    """Metrics that a cell of the leaderboard holds."""
-    return " / ".join(dict.fromkeys(f"{s.title} [{_column(s).unit}]" for s in shown))
+def _metric_labels(standings: Sequence[Standing]) -> str:
+    """Return the metrics of a cell of the leaderboard, with their units."""
+    return " / ".join(dict.fromkeys(f"{s.title} [{_column(s).unit}]" for s in standings))
 
 
-def _totals(policy: str, everything: Sequence[Standing]) -> list[str]:
-    """Failed episodes of all, and time per step; nothing in a table without totals."""
-    own = [s for s in everything if s.policy == policy]
-    if not own:
+def _totals(policy: str, standings: Sequence[Standing]) -> list[str]:
+    """Return failed episodes of all, and time per step; nothing for a table without totals."""
+    of_policy = [s for s in standings if s.policy == policy]
+    if not of_policy:
         return []
-    single = [s for s in own if not s.is_group and s.metric == own[0].metric]
-    step_us = own[0].step_us
+    single = [s for s in of_policy if not s.is_group and s.metric == of_policy[0].metric]
+    step_us = of_policy[0].step_us
     failed = f"{sum(s.failed for s in single)}/{sum(s.episodes for s in single)}"
     return [failed, "-" if math.isnan(step_us) else f"{step_us:.0f}"]
 
 
 def _entry(
-    found: Sequence[Standing], best: Mapping[tuple[str, str, str], str | None]
+    standings: Sequence[Standing], best: Mapping[tuple[str, str, str], str | None]
 ) -> tuple[Part, ...]:
-    """Figures of all metrics, failures, and the intervals below."""
-    if not found:
+    """Return the figures of all metrics, failures, and intervals below them."""
+    if not standings:
         return (Part("not played"),)
     parts = []
     intervals = []
-    for s in found:
+    for s in standings:
         score = s.score.times(_column(s).scale)
         look = "bold" if best[s.scope, s.reference, s.metric] == s.policy else ""
-        before = " / " if parts else ""
-        parts.append(Part(three_digits(score.value), look, before))
+        parts.append(Part(three_digits(score.value), look, " / " if parts else ""))
         if score.has_interval:
             low, high = map(three_digits, score.ends)
             intervals.append(Part(f"[{low}, {high}]", "small"))
-    if found[0].failed:
-        failed = f"✕{found[0].failed}/{found[0].episodes}"
-        parts.append(Part(failed, "failure", before=" "))
+    if standings[0].failed:
+        parts.append(Part(f"✕{standings[0].failed}/{standings[0].episodes}", "failure", before=" "))
     return (*parts, *intervals)
 
 
 def three_digits(value: float) -> str:
-    """A number with three digits: 2.48, 11.2, 123; - where there is none."""
+    """Return a number with three digits: 2.48, 11.2, 123; "-" if it is not finite."""
     if not math.isfinite(value):
         return "-"
     size = abs(float(f"{value:.2e}"))
@@ -134,14 +131,14 @@ def _column(standing: Standing) -> Column:
     return Column(standing.title, standing.metric)
 
 
-def claims_table(found: Sequence[Standing]) -> Table:
-    """The paired changes of residuals in every column; no rows without residuals."""
-    learned = [s for s in found if s.is_column and s.training_seeds]
+def claims_table(standings: Sequence[Standing]) -> Table:
+    """Return the paired changes of residuals in every column; no rows without residuals."""
+    learned = [s for s in standings if s.is_column and s.training_seeds]
     rows = []
     lines = group_by(learned, lambda s: (s.policy, s.scope, s.reference))
-    for (policy, scope, reference), own in lines.items():
+    for (policy, scope, reference), line in lines.items():
         cells = [policy, f"{scope}, {reference}"]
-        for s in own:
+        for s in line:
             base = None if s.base is None else s.base.to
             is_same = s.rival is not None and s.rival.to == base
             cells += [_change(s.base), "the same" if is_same else _change(s.rival)]
@@ -153,68 +150,67 @@ def claims_table(found: Sequence[Standing]) -> Table:
 
 
 def _change(paired: Paired | None) -> str:
-    """A paired change: value, interval, a sign where nothing is shown, and the opponent."""
+    """Return a paired change: value, interval, a sign for no difference, and the opponent."""
     if paired is None:
         return "-"
     return f"{signed_interval(paired.change, paired.verdict)} ({paired.to})"
 
 
-_MOST_NAMED = 3
-"""Kinds of intervals that a legend names."""
+_MAX_INTERVAL_KINDS = 3
+"""Largest number of kinds of intervals that a legend names."""
 
 
-def legend(found: Sequence[Standing]) -> str:
-    """Meaning of a cell, and its number of episodes."""
-    meaning = _meaning([s for s in found if s.is_column])
-    single = [s for s in found if not s.is_group]
+def _legend(standings: Sequence[Standing]) -> str:
+    """Return the meaning of a cell, and its number of episodes."""
+    meaning = _metric_labels([s for s in standings if s.is_column])
+    single = [s for s in standings if not s.is_group]
     counts = sorted({s.episodes // max(s.training_seeds, 1) for s in single})
     span = f"{counts[0]} to {counts[-1]}" if len(counts) > 1 else str(counts[0])
     episodes = f"episodes of a scenario, per training seed: {span}"
-    over = dict.fromkeys(s.interval_over for s in found if s.interval_over)
+    over = dict.fromkeys(s.interval_over for s in standings if s.interval_over)
     within = f" over {', or '.join(over)}"
-    if len(over) > _MOST_NAMED:
+    if len(over) > _MAX_INTERVAL_KINDS:
         within = ", and column `interval_over` of leaderboard.csv says over what"
     intervals = f" Intervals are 95 %{within}." if over else ""
-    published = TEXTS["published"] if any(s.is_published for s in found) else ""
+    published = TEXTS["published"] if any(s.is_published for s in standings) else ""
     return f"{capital(meaning)}; {episodes}. {TEXTS['leaderboard']}{intervals}{published}"
 
 
-def add_leaderboard(page: Page, found: Sequence[Standing]) -> None:
-    """Add the leaderboard to a page, with what learning adds and the single scenarios."""
-    page.section("Leaderboard", legend(found))
-    page.add("table", board(found))
-    claims = claims_table(found)
+def add_leaderboard(page: Page, standings: Sequence[Standing]) -> None:
+    """Add the leaderboard to a page, with changes of residuals, and the single scenarios."""
+    page.section("Leaderboard", _legend(standings))
+    page.add("table", leaderboard_table(standings))
+    claims = claims_table(standings)
     if claims.rows:
         page.add("text", TEXTS["paired"].format(signs=SIGNS_ARE), "What learning adds")
         page.add("table", claims)
-    single = scenarios_board(found)
+    single = scenarios_table(standings)
     if single is not None:
-        title = f"Single scenarios, {found[0].reference}"
-        page.add("table", single, title, is_folded=True)
+        page.add("table", single, f"Single scenarios, {standings[0].reference}", is_folded=True)
 
 
-def leaderboard_markdown(found: Sequence[Standing]) -> str:
-    """The tables of the leaderboard, without a title."""
+def leaderboard_markdown(standings: Sequence[Standing]) -> str:
+    """Return the tables of the leaderboard, without a title."""
     page = Page("", "")
-    add_leaderboard(page, found)
+    add_leaderboard(page, standings)
     return "\n\n".join(page.sections[0].as_markdown[1:]) + "\n"
 
 
-def print_leaderboard(found: Sequence[Standing], console: Console) -> None:
-    """Print the leaderboard with as many columns as the terminal has room for."""
-    print_table(board(found), console, "leaderboard.md")
+def print_leaderboard(standings: Sequence[Standing], console: Console) -> None:
+    """Print the columns of the leaderboard for which the terminal has room."""
+    print_table(leaderboard_table(standings), console, "leaderboard.md")
 
 
-def write_leaderboard(found: Sequence[Standing], folder: Path) -> list[Path]:
+def write_leaderboard(standings: Sequence[Standing], folder: Path) -> list[Path]:
     """Write `leaderboard.csv` and `leaderboard.md`."""
-    table = write_records(list(map(_record, found)), folder / "leaderboard.csv")
+    table = write_records(list(map(_record, standings)), folder / "leaderboard.csv")
     text = folder / "leaderboard.md"
-    board = leaderboard_markdown(found)
-    write_whole(text, f"# Leaderboard\n\n{board}")
+    write_whole(text, f"# Leaderboard\n\n{leaderboard_markdown(standings)}")
     return [table, text]
 
 
 def _record(standing: Standing) -> dict[str, str]:
+    """Return the row of a standing in `leaderboard.csv`."""
     record = {}
     for name, value in vars(standing).items():
         columns = COLUMNS.get(name, (name,))
@@ -223,7 +219,7 @@ def _record(standing: Standing) -> dict[str, str]:
 
 
 def _cells(value: Any, number: int) -> list[str]:
-    """A field as cells of a CSV file, empty where there is nothing."""
+    """Return a field as cells of a CSV file; None gives empty cells."""
     if isinstance(value, Paired):
         return [value.to, *_cells(value.change, 3), value.verdict]
     if isinstance(value, Estimate):
@@ -232,63 +228,65 @@ def _cells(value: Any, number: int) -> list[str]:
     return [""] * number if value is None else [str(value)]
 
 
-def find_published(given: Path) -> Path:
-    """A leaderboard of the user's, or the one of the package that is called `leaderboard`.
+def find_published(path: Path) -> Path:
+    """Return a leaderboard of the user, or the one of the package, whose name is `leaderboard`.
 
     Raises:
-        ConfigurationError: There is neither.
+        ConfigurationError: Neither exists.
     """
-    shipped = Path(str(resources.files("train") / "published" / f"{given}.csv"))
-    if given.is_file():
-        return given
-    if not given.suffix and shipped.is_file():
+    shipped = Path(str(resources.files("train") / "published" / f"{path}.csv"))
+    if path.is_file():
+        return path
+    if not path.suffix and shipped.is_file():
         return shipped
     cure = "give a leaderboard.csv, or the name of the published one: leaderboard"
-    raise ConfigurationError(f"no published leaderboard at {shorten(given)}; {cure}")
+    raise ConfigurationError(f"no published leaderboard at {shorten(path)}; {cure}")
 
 
 def read_leaderboard(path: Path) -> list[Standing]:
-    """The rows of a `leaderboard.csv`.
+    """Read the rows of a `leaderboard.csv`.
 
     Raises:
-        ConfigurationError: It is none.
+        ConfigurationError: The file is no leaderboard, or has no rows.
     """
     with path.open(newline="", encoding="utf-8") as file:
         try:
-            found = [_standing(row) for row in csv.DictReader(file)]
+            standings = [_standing(row) for row in csv.DictReader(file)]
         except ValidationError as error:
-            said = error.errors()[0]["msg"]
-            raise ConfigurationError(f"{shorten(path)} is no leaderboard.csv: {said}") from None
+            problem = error.errors()[0]["msg"]
+            raise ConfigurationError(f"{shorten(path)} is no leaderboard.csv: {problem}") from None
         except (KeyError, TypeError, ValueError, csv.Error) as error:
             problem = f"{shorten(path)} is no leaderboard.csv: {error!r}"
             raise ConfigurationError(problem) from None
-    if not found:
+    if not standings:
         raise ConfigurationError(f"{shorten(path)} has no rows")
-    return found
+    return standings
 
 
 def _standing(row: Mapping[str, str]) -> Standing:
+    """Return the standing in a row of `leaderboard.csv`."""
     fields = {}
     for name in Standing.__dataclass_fields__:
         columns = COLUMNS.get(name, (name,))
-        if name in _NEW and columns[0] not in row:
-            continue  # of a leaderboard that was written before there was one
+        if name in _NEW_FIELDS and columns[0] not in row:
+            continue  # an older version wrote the leaderboard
         cells = [row[column] for column in columns]
-        fields[name] = _FIELDS[len(cells)](*cells)
+        fields[name] = _PARSERS[len(cells)](*cells)
     return _STANDING.validate_python(fields)
 
 
-def _estimate(value: str, low: str, high: str) -> Estimate:
+def _parse_estimate(value: str, low: str, high: str) -> Estimate:
     if not low:
         return Estimate(float(value))
     return Estimate(float(value), float(low), float(high))
 
 
-def _paired(to: str, value: str, low: str, high: str, verdict: str) -> Paired | None:
-    return Paired(to, _estimate(value, low, high), verdict) if to else None
+def _parse_paired(to: str, value: str, low: str, high: str, verdict: str) -> Paired | None:
+    return Paired(to, _parse_estimate(value, low, high), verdict) if to else None
 
 
-_NEW = ("interval_over", "origin", "is_published")
-_FIELDS: Mapping[int, Callable[..., Any]] = {1: str, 3: _estimate, 5: _paired}
-"""Fields from so many columns."""
+_NEW_FIELDS = ("interval_over", "origin", "is_published")
+"""Fields that older leaderboards lack."""
+_PARSERS: Mapping[int, Callable[..., Any]] = {1: str, 3: _parse_estimate, 5: _parse_paired}
+"""Functions that make a field from its cells, by the number of cells."""
 _STANDING = TypeAdapter(Standing)

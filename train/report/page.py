@@ -2,21 +2,22 @@
 
 import base64
 import tomllib
-from collections.abc import Iterable
 from dataclasses import dataclass, field
 from itertools import chain
 from pathlib import Path
 from typing import Any, Literal
 
 from train.figures.map_plots import Panel, panel_rows
-from train.report.table_formats import Table, load_template, to_markdown
+from train.report.markdown import bullets, to_markdown
+from train.report.tables import Table
+from train.report.templates import load_template
 from train.runs.escaping import markdown_text
 
 _FILE = Path(__file__).with_name("texts.toml")
 TEXTS = tomllib.loads(_FILE.read_text(encoding="utf-8"))
 """Paragraphs by section or table."""
-_SHOWN = {".png": "png", ".svg": "svg+xml"}
-"""Pictures that a page shows, by the ending of their files."""
+_PICTURE_TYPES = {".png": "png", ".svg": "svg+xml"}
+"""Types of pictures that a page shows, by the suffix of their files."""
 Kind = Literal["bullets", "definitions", "table", "map", "text", "caption", "chart", "picture"]
 
 
@@ -25,12 +26,13 @@ class Part:
     """A part of a section.
 
     Attributes:
-        kind: What it is; captions, charts and pictures stand on the page alone.
+        kind: Kind of the content; captions, charts and pictures are on the page only.
         content: A text, texts, pairs of texts, a `Table`, a chart's `Spec`, the panels of a map, or
-            the file of a picture beside the page.
-        title: Above it; empty for none.
-        is_folded: Whether it is folded away under its title. A chart is drawn when it is unfolded.
-        is_open: Whether it is unfolded at first.
+            the file of a picture in the folder of the page.
+        title: Title above the content; empty for none.
+        is_folded: True if the part can be folded under its title. A chart is drawn when it is
+            unfolded.
+        is_open: True if the part is unfolded at first.
     """
 
     kind: Kind
@@ -41,14 +43,14 @@ class Part:
 
     @property
     def data(self) -> str:
-        """A picture as an address that holds it; empty where a page cannot show its kind."""
-        kind = _SHOWN.get(self.content.suffix)
+        """A picture as a data URL; empty if a page cannot show its type."""
+        kind = _PICTURE_TYPES.get(self.content.suffix)
         content = base64.b64encode(self.content.read_bytes()).decode()
         return f"data:image/{kind};base64,{content}" if kind else ""
 
     @property
     def as_markdown(self) -> list[str]:
-        """Blocks of Markdown; none of a chart."""
+        """Blocks of Markdown; none for a chart."""
         if self.kind in ("caption", "chart", "picture"):
             return []
         blocks = [f"### {markdown_text(self.title)}"] if self.title else []
@@ -74,7 +76,7 @@ class Section:
 
     @property
     def as_markdown(self) -> list[str]:
-        """Blocks of Markdown; none of a section of charts."""
+        """Blocks of Markdown; none for a section of charts."""
         blocks = [block for part in self.parts for block in part.as_markdown]
         text = [markdown_text(self.text)] if self.text else []
         return [f"## {markdown_text(self.title)}", *text, *blocks] if blocks else []
@@ -84,8 +86,8 @@ class Page:
     """A page that grows section by section, with a table of contents. All texts are plain.
 
     Args:
-        title: Its title.
-        under: A line under it.
+        title: Title of the page.
+        under: Line under the title.
     """
 
     def __init__(self, title: str, under: str) -> None:
@@ -98,26 +100,21 @@ class Page:
         self.sections.append(Section(title, text))
 
     def add(self, kind: Kind, content: Any, title: str = "", **folding: bool) -> None:
-        """Add a `Part` to the section."""
+        """Add a `Part` to the last section."""
         self.sections[-1].parts.append(Part(kind, content, title, **folding))
 
     def html(self, plotly_js: str) -> str:
-        """The whole page, with the source of plotly.js in it."""
+        """Return the whole page, which contains the source of plotly.js."""
         return load_template().render(page=self, plotly_js=plotly_js)
 
     def as_markdown(self) -> str:
-        """The texts and tables of the page."""
+        """Return the texts and tables of the page."""
         blocks = [block for section in self.sections for block in section.as_markdown]
         return "\n\n".join([f"# {markdown_text(self.title)}", *blocks]) + "\n"
 
 
-def bullets(texts: Iterable[str]) -> str:
-    """A list in Markdown."""
-    return "\n".join(f"* {markdown_text(text)}" for text in texts)
-
-
 def _panel(panel: Panel) -> list[str]:
-    """Title and table of a panel of a map."""
+    """Return title and table of a panel of a map."""
     key = ", ".join(f"{letter} {title}" for letter, title, _ in panel.key)
     title = f"{panel.title} ({key}):" if key else f"{panel.title}:"
     return [markdown_text(title), to_markdown(Table.plain(*panel_rows(panel)))]

@@ -1,4 +1,4 @@
-"""The results of a comparison, and the sentences of a report, whatever it is written in."""
+"""Results of a comparison, and the sentences of its report, for all formats."""
 
 import json
 import re
@@ -22,7 +22,7 @@ from train.evaluate.standings import Standing
 from train.evaluate.statistics import Estimate
 from train.evaluate.table import EpisodeTable, failures
 from train.figures.colours import policy_colours
-from train.report.table_formats import load_template
+from train.report.templates import load_template
 
 
 @dataclass(frozen=True)
@@ -33,11 +33,11 @@ class Results:
         name: Name of the comparison.
         evaluations: All cells, one per training seed.
         changes: Paired changes.
-        folder: Where the comparison's files are, with its metadata.
-        swept: What the axis of a sweep says; None without one.
-        maps: Heat maps over two axes, where such are wanted.
-        standings: Rows of the leaderboard, where one is wanted.
-        robots: Scores over the robots of the cells that draw them.
+        folder: Folder of the comparison's files and metadata.
+        swept: Label of the axis of a sweep; None without one.
+        maps: Heat maps over two axes; empty without a map.
+        standings: Rows of the leaderboard; empty without one.
+        robots: Scores over the robots of cells that draw them.
     """
 
     name: str
@@ -66,11 +66,11 @@ class Results:
 
     @cached_property
     def learning(self) -> dict[str, Curves]:
-        """Learning curves of the families whose folders lie in a training run."""
+        """Learning curves of the families whose folders are in a training run."""
         families = self.table.families.items()
         judged = self.environment.judged
-        found = [(title, learning_curves(own.folders, judged)) for title, own in families]
-        return {title: curves for title, curves in found if curves is not None}
+        curves = {title: learning_curves(family.folders, judged) for title, family in families}
+        return {title: curve for title, curve in curves.items() if curve is not None}
 
     @cached_property
     def metadata(self) -> Mapping[str, Any]:
@@ -79,7 +79,7 @@ class Results:
 
     @property
     def grouped_changes(self) -> dict[str, list[Change]]:
-        """Changes by what is compared with what."""
+        """Changes by kinds of the compared policies."""
         kinds = group_by(self.changes, lambda row: (row.is_family, row.is_rival))
         return {
             "Residuals against their base": kinds.get((True, False), []),
@@ -89,66 +89,64 @@ class Results:
 
     @property
     def judged_changes(self) -> list[Change]:
-        """Changes of residuals in what policies are judged by."""
+        """Changes of residuals in judged metrics."""
         return [row for row in self.changes if row.is_family and row.is_judged]
 
     @property
     def compared_pairs(self) -> list[list[Change]]:
-        """These, by residual and kind of opponent."""
-        pairs = group_by(self.judged_changes, lambda row: (row.policy, row.is_rival))
-        return list(pairs.values())
+        """`judged_changes` by residual and kind of opponent."""
+        return list(group_by(self.judged_changes, lambda row: (row.policy, row.is_rival)).values())
 
     @property
-    def with_rival(self) -> set[str]:
+    def rivalled_residuals(self) -> set[str]:
         """Residuals that are compared with the best policy without learning."""
         return {row.policy for row in self.changes if row.is_rival}
 
     @property
     def claims(self) -> list[tuple[Change, Change]]:
-        """Changes against the best policy without learning, each with that against the base.
+        """Changes against the best policy without learning, each with the change against the base.
 
-        Of the groups; without groups of the scenarios, where there are few.
+        They are the changes in groups. Without groups, they are those in scenarios, if there are
+        few.
         """
         rivals = [row for row in self.judged_changes if row.is_rival]
         others = [row for row in self.judged_changes if not row.is_rival]
         bases = {(row.policy, row.place, row.column): row for row in others[::-1]}
         shown = [row for row in rivals if row.is_group]
-        if not shown and len({(row.policy, row.place) for row in rivals}) <= _MOST_CLAIMS:
+        if not shown and len({(row.policy, row.place) for row in rivals}) <= _MAX_CLAIMS:
             shown = rivals
         return [(row, bases[row.policy, row.place, row.column]) for row in shown]
 
     @property
     def has_conditions(self) -> bool:
-        """True if its cells are conditions of their own, and not points of a curve or a map."""
+        """True if the cells are separate conditions, not points of a curve or a map."""
         return self.swept is None and not self.maps
 
 
-_MOST_CLAIMS = 4
-"""Scopes and metrics of which each has a sentence, without groups."""
+_MAX_CLAIMS = 4
+"""Largest number of scenarios that have a sentence each, if there are no groups."""
 
 
 def sentences(kind: Literal["headline", "in_short", "notes"], results: Results) -> list[str]:
-    """Paragraphs of plain text that a macro of `sentences.j2` makes of the results."""
+    """Return the paragraphs that a macro of `sentences.j2` writes about the results."""
     kinds = (terms.HELD_OUT, terms.PARTLY, terms.CEILING, terms.SAME_ROBOT)
     marks = {mark for row in results.changes for mark in row.marks}
     helpers = {
         "terms": terms,
         "failures": failures,
-        "ranked": _ranked,
+        "ranked": _rank_policies,
         "by_metric": lambda rows: group_by(rows, lambda row: row.column).values(),
         "marks": [kind for kind in kinds if any(mark.startswith(kind) for mark in marks)],
         "verdict_words": _VERDICTS,
     }
-    module = load_template("sentences.j2").make_module(helpers)
-    text = getattr(module, kind)(results)
-    parts = [re.sub(r"[ \n]+", " ", part).strip() for part in text.split("\n\n")]
-    return list(filter(None, parts))
+    text = getattr(load_template("sentences.j2").make_module(helpers), kind)(results)
+    return list(filter(None, [re.sub(r"[ \n]+", " ", part).strip() for part in text.split("\n\n")]))
 
 
-def _ranked(table: EpisodeTable) -> list[dict[str, Any]]:
-    """Policies from the best to the worst by the first judged metric.
+def _rank_policies(table: EpisodeTable) -> list[dict[str, Any]]:
+    """Return the policies from the best to the worst by the first judged metric.
 
-    With their scores as they are shown, and whether each is ahead in every cell.
+    Each has its score as text, and for every cell whether it is ahead.
     """
     column = table.environment.judged[0]
     scores = _scores(table.rows, column)
@@ -164,12 +162,12 @@ def _ranked(table: EpisodeTable) -> list[dict[str, Any]]:
 
 
 def _scores(rows: pd.DataFrame, column: Column) -> Scores:
-    """Mean of every policy over training seeds and cells [SI], and failures."""
-    found = {}
-    for title, own in rows.groupby("policy", sort=False):
-        means: Any = own.groupby(["member", "cell"])[column.metric].mean()
-        found[str(title)] = Estimate(float(means.mean())), failures(own)
-    return found
+    """Return the mean of every policy over training seeds and cells [SI], and failures."""
+    scores = {}
+    for title, episodes in rows.groupby("policy", sort=False):
+        means: Any = episodes.groupby(["member", "cell"])[column.metric].mean()
+        scores[str(title)] = Estimate(float(means.mean())), failures(episodes)
+    return scores
 
 
 _VERDICTS: Mapping[Verdict, str] = {
@@ -181,13 +179,14 @@ _VERDICTS: Mapping[Verdict, str] = {
 
 
 def facts(results: Results) -> list[tuple[str, str]]:
-    """The subject of the comparison, its date and versions: terms and texts."""
+    """Return terms and texts: policies, episodes, date, versions, trainings."""
     table = results.table
     origin = results.metadata
     seeds = table.rows["seed"].tolist()
     per_cell = sorted({len(e.episodes) for e in results.evaluations})
-    known = {name: version for name, version in origin["versions"].items() if version}
-    versions = ", ".join(f"{name} {version}" for name, version in known.items())
+    versions = ", ".join(
+        f"{name} {version}" for name, version in origin["versions"].items() if version
+    )
     each = " and training seed" if table.members else ""
     played = f"{_span(per_cell)} per cell{each}, seeds {_span(sorted({min(seeds), max(seeds)}))}"
     return [
@@ -216,5 +215,5 @@ def _span(numbers: Sequence[int]) -> str:
 
 
 def capital(text: str) -> str:
-    """With a capital at the beginning."""
+    """Return a text with a capital at the beginning."""
     return text[:1].upper() + text[1:]

@@ -1,4 +1,4 @@
-"""Scores as tables: of cells, over drawn robots, and on the way of a training."""
+"""Tables of scores: of cells, over drawn robots, and during trainings."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import product
@@ -14,23 +14,23 @@ from train.evaluate.robots import RobotScores
 from train.evaluate.statistics import Estimate
 from train.evaluate.table import EpisodeTable, by_episode, score
 from train.figures.chart import quantiles
-from train.report.table_formats import Head, Row, Table, number_interval, print_table
+from train.report.tables import Head, Row, Table, number_interval
+from train.report.terminal import print_table
 from train.runs.escaping import write_records
 
 
 def scores_table(table: EpisodeTable, columns: Sequence[Column]) -> Table:
-    """Mean of every policy in every cell, with intervals."""
+    """Return the mean of every policy in every cell, with intervals."""
     rows = []
-    places = product(table.references, table.scenarios, table.policies)
-    for reference, scenario, policy in places:
+    for reference, scenario, policy in product(table.references, table.scenarios, table.policies):
         for cell in table.cells_of(policy, reference, scenario):
             condition = table.conditions[policy, cell]
-            own = table.of(policy, cell)
-            own = by_episode(own) if condition.member is None else own
-            units = ([len(set(own["robot"]))], [condition.draws_robots])
-            scores = [of_units(score(own, column), *units) for column in columns]
+            episodes = table.of(policy, cell)
+            episodes = by_episode(episodes) if condition.member is None else episodes
+            units = ([len(set(episodes["robot"]))], [condition.draws_robots])
+            scores = [of_units(score(episodes, column), *units) for column in columns]
             figures = map(number_interval, scores, columns)
-            over = next((found.over for found in scores if found.over), "-")
+            over = next((estimate.over for estimate in scores if estimate.over), "-")
             values = condition.swept_values(table.swept)
             rows.append([reference, scenario, policy, *values, *figures, over])
     labels = [column.label for column in columns]
@@ -39,7 +39,7 @@ def scores_table(table: EpisodeTable, columns: Sequence[Column]) -> Table:
 
 
 def learning_table(learning: Mapping[str, Curves], columns: Sequence[Column]) -> Table:
-    """Share of the base's score on the way of a training, over training seeds."""
+    """Return the score as a share of the base's during trainings, over training seeds."""
     rows = []
     for title, curves in learning.items():
         for column in columns:
@@ -51,14 +51,14 @@ def learning_table(learning: Mapping[str, Curves], columns: Sequence[Column]) ->
     return Table.plain(head, rows, words=2)
 
 
-def robots_table(found: Sequence[RobotScores]) -> Table:
-    """All scores over drawn robots, a row per cell and metric."""
-    figures = ("mean", "interquartile mean", "worst tenth", found[0].failure)
+def robots_table(cells: Sequence[RobotScores]) -> Table:
+    """Return all scores over drawn robots: a row per cell and metric."""
+    figures = ("mean", "interquartile mean", "worst tenth", cells[0].failure)
     head = ["reference", "scenario", "policy", "metric", *figures, "95 % over"]
     rows = []
-    for row in found:
+    for row in cells:
         names = (row.reference, row.scope, row.policy, row.column.label)
-        scores = [number_interval(own, row.column) for own in row.scores]
+        scores = [number_interval(estimate, row.column) for estimate in row.scores]
         better = [
             f"{title}: {percent_interval(share, signed=False)}"
             for title, share in row.better.items()
@@ -70,34 +70,34 @@ def robots_table(found: Sequence[RobotScores]) -> Table:
     return Table((*heads, Head("better than", is_number=False)), tuple(rows), keys=4)
 
 
-def print_robots(found: Sequence[RobotScores], console: Console) -> None:
+def print_robots(cells: Sequence[RobotScores], console: Console) -> None:
     """Print a line per policy with all metrics, under the motion and the scenario."""
-    if not found:
+    if not cells:
         return
-    columns = list(dict.fromkeys(row.column for row in found))
+    columns = list(dict.fromkeys(row.column for row in cells))
     heads = [
         Head(column.title, column.unit, second=figure, leaves=turn)
         for column in columns
         for figure, turn in (("mean", 3), ("middle half", 1), ("worst tenth", 2))
     ]
-    heads = [Head("policy", is_number=False), *heads, Head(found[0].failure)]
+    heads = [Head("policy", is_number=False), *heads, Head(cells[0].failure)]
     rows = []
-    for names, cell in group_by(found, lambda row: (row.reference, row.scope)).items():
+    for names, group in group_by(cells, lambda row: (row.reference, row.scope)).items():
         rows.append(Row((", ".join(names),), kind="heading"))
-        for policy, own in group_by(cell, lambda row: row.policy).items():
-            figures = {row.column: row.scores for row in own}
-            failed = f"{own[0].failed}/{own[0].episodes}"
-            cells = (
+        for policy, metrics in group_by(group, lambda row: row.policy).items():
+            figures = {row.column: row.scores for row in metrics}
+            failed = f"{metrics[0].failed}/{metrics[0].episodes}"
+            texts = (
                 number_interval(score, column) for column in columns for score in figures[column]
             )
-            rows.append(Row((policy, *cells, failed)))
-    number = max(row.mean.robots for row in found)
+            rows.append(Row((policy, *texts, failed)))
+    number = max(row.mean.robots for row in cells)
     title = f"means over up to {number} drawn robots, those that did not fail [95 % interval]"
     print_table(Table(tuple(heads), tuple(rows), title=title), console, "robots.csv")
 
 
 def write_robots(rows: Sequence[RobotScores], path: Path) -> Path:
-    """One row per cell, metric and other policy; metrics in SI units, shares as shares of one."""
+    """Write a CSV row per cell, metric and other policy: metrics in SI units."""
     return write_records([record for row in rows for record in _records(row)], path)
 
 

@@ -13,22 +13,22 @@ from train.runs.escaping import chart_text
 
 FONT = "system-ui, -apple-system, 'Segoe UI', Roboto, 'DejaVu Sans', sans-serif"
 LONGEST_NAME = 34
-"""Letters of a policy that stand beside an axis."""
+"""Longest name of a policy at an axis [letters]."""
 _LEGEND_ROW = 150
-"""Letters in a row of a legend."""
+"""Length of a row of a legend [letters]."""
 _PIXELS = 110
-"""Pixels for an inch of a picture."""
+"""Pixels per inch of a picture."""
 _STRIP = 8
-"""Pixels of the strip that marks times."""
+"""Height of the strip that marks times [px]."""
 _GAP = 0.05
-"""Share of the height between panels."""
+"""Gap between panels, as a share of the height."""
 
 Spec = dict[str, Any]
 """A chart, with its height in the layout [px], or a part of it."""
 
 
 def page_chart(chart: Chart) -> Spec:
-    """The panels of a chart one below the other, with a legend on top."""
+    """Return the panels of a chart one below the other, with a legend on top."""
     curves = [curve for panel in chart.panels for curve in panel.curves]
     names = dict.fromkeys(curve.name for curve in curves if curve.name)
     legend_rows = -(-sum(len(name) + 9 for name in names) // _LEGEND_ROW)
@@ -78,12 +78,11 @@ def _panel_axis(panel: Panel, place: Sequence[float]) -> Spec:
         options = {"tickvals": places, "ticktext": titles, "showgrid": False}
     if panel.limits is not None:
         options["range"] = [digits(end) for end in panel.limits]
-    label = "" if panel.rows else panel.label
-    return base_axis(label, domain=list(place), anchor="x", **options)
+    return base_axis("" if panel.rows else panel.label, domain=list(place), anchor="x", **options)
 
 
 def _curve_traces(curve: Curve, axis: str, is_first: bool) -> list[Spec]:
-    """A line, below it the band around it."""
+    """Return a line, and before it the band around it."""
     x: Spec = {"x": curve.x.tolist()}
     if len(curve.x) >= 20:  # evenly spaced
         x = {"x0": digits(float(curve.x[0])), "dx": digits(float(curve.x[1] - curve.x[0]))}
@@ -106,14 +105,14 @@ def _curve_traces(curve: Curve, axis: str, is_first: bool) -> list[Spec]:
     if curve.band is None:
         return [line]
     style = {"mode": "lines", "showlegend": False, "hoverinfo": "skip"}
-    hidden = {**line, **style, "line": {"width": 0}}
+    edge = {**line, **style, "line": {"width": 0}}
     low, high = map(numbers, curve.band)
-    filled = {"fill": "tonexty", "fillcolor": see_through(curve.colour)}
-    return [{**hidden, "y": low}, {**hidden, "y": high, **filled}, line]
+    filled = {"fill": "tonexty", "fillcolor": translucent(curve.colour)}
+    return [{**edge, "y": low}, {**edge, "y": high, **filled}, line]
 
 
 def _band(begin: float, end: float, colour: str, ends: tuple[float, float] = (0, 1)) -> Spec:
-    """A time in a colour, between two heights of the chart as shares of it."""
+    """Return a coloured time span, between two heights as shares of the chart."""
     x = {"xref": "x", "x0": digits(begin), "x1": digits(end)}
     y = {"yref": "paper", "y0": round(ends[0], 6), "y1": round(ends[1], 6)}
     look = {"fillcolor": colour, "line": {"width": 0}, "layer": "below"}
@@ -121,12 +120,12 @@ def _band(begin: float, end: float, colour: str, ends: tuple[float, float] = (0,
 
 
 def cut_name(name: str) -> str:
-    """The end of a name that is too long: of a path it is what differs."""
+    """Return a name, or the end of a long one, since the ends of paths differ."""
     return name if len(name) <= LONGEST_NAME else "…" + name[1 - LONGEST_NAME :]
 
 
 def error_bars(estimates: Sequence[Estimate], colour: str) -> Spec:
-    """Intervals around points."""
+    """Return intervals around points."""
     return {
         "type": "data",
         "symmetric": False,
@@ -140,7 +139,7 @@ def error_bars(estimates: Sequence[Estimate], colour: str) -> Spec:
 
 
 def base_layout(left: float, top: float, bottom: float) -> Spec:
-    """The layout that all charts have in common, with its margins [px]."""
+    """Return the common layout of all charts, with margins [px]."""
     return {
         "paper_bgcolor": "white",
         "plot_bgcolor": "white",
@@ -152,7 +151,7 @@ def base_layout(left: float, top: float, bottom: float) -> Spec:
 
 
 def base_axis(title: str = "", **options: Any) -> Spec:
-    """An axis."""
+    """Return an axis."""
     return {
         "title": {"text": title, "font": {"size": 13}, "standoff": 8},
         "gridcolor": GRID,
@@ -165,28 +164,28 @@ def base_axis(title: str = "", **options: Any) -> Spec:
 
 
 def domain(number: int, count: int, gap: float) -> list[float]:
-    """Domain of a panel among several."""
+    """Return the domain of a panel among several."""
     width = (1.0 - gap * (count - 1)) / count
     begin = number * (width + gap)
     return [round(begin, 6), round(min(begin + width, 1.0), 6)]
 
 
 def nth(number: int) -> str:
-    """The number of an axis in plotly: the first has none."""
+    """Return the suffix of an axis in plotly; the first axis has none."""
     return "" if number == 0 else str(number + 1)
 
 
-def see_through(colour: str) -> str:
-    """A colour that lets through what is behind it."""
+def translucent(colour: str) -> str:
+    """Return a translucent form of a colour."""
     red, green, blue = (int(colour[i : i + 2], 16) for i in (1, 3, 5))
     return f"rgba({red},{green},{blue},0.18)"
 
 
 def numbers(values: Array) -> list[float | None]:
-    """Values for plotly, None where there is none."""
+    """Return values for plotly, None for those that are not finite."""
     return [digits(float(value)) if np.isfinite(value) else None for value in values]
 
 
 def digits(value: float) -> float:
-    """A number with the digits that a picture can show; nan stays."""
+    """Return a number with the digits that a picture can show; nan stays nan."""
     return float(f"{value:.5g}")

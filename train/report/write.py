@@ -1,6 +1,6 @@
 """The report of a comparison: `report.html`, which works offline, and `report.md`."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from elastic_env.core.errors import missing_extra
@@ -21,15 +21,15 @@ from train.report.report_text import Results, capital, facts, sentences
 from train.report.score_tables import learning_table, robots_table, scores_table
 from train.report.specs import page_chart
 from train.report.summary import bound_notes
-from train.report.table_formats import Table, load_template
+from train.report.tables import Table
+from train.report.templates import load_template
 
-_LONG = 40
-"""Rows from which on a table is folded away."""
-_POINTS = 600
-_LEAST_POINTS = 250
-_ALL_POINTS = 6000
-"""Points of a curve, at most and at least, and of all cells together, so that a large comparison
-stays small.
+_MAX_OPEN_ROWS = 40
+"""Largest number of rows of a table that is not folded."""
+_MAX_POINTS = 600
+_MIN_POINTS = 250
+_TOTAL_POINTS = 6000
+"""Points of a curve, at most and at least, and of all cells together; they limit the report's size.
 """
 
 
@@ -44,7 +44,7 @@ def require_libraries() -> None:
 
 
 def require_plotly() -> str:
-    """The source of plotly.js, to be put into a page.
+    """Return the source of plotly.js, for a page.
 
     Raises:
         MissingExtraError: Plotly is not installed.
@@ -57,7 +57,7 @@ def require_plotly() -> str:
 
 
 def write_report(results: Results) -> list[Path]:
-    """Write `report.html` and `report.md` beside the other files of a comparison."""
+    """Write `report.html` and `report.md` into the folder of a comparison."""
     return write_page(_page(results), results.folder)
 
 
@@ -70,8 +70,7 @@ def write_page(page: Page, folder: Path) -> list[Path]:
 
 
 def _page(results: Results) -> Page:
-    subject = capital(results.environment.subject)
-    under = f"{subject}; made {results.metadata['created'][:10]}"
+    under = f"{capital(results.environment.subject)}; made {results.metadata['created'][:10]}"
     page = Page(f"Comparison: {results.name}", under)
     page.section("What was compared", *sentences("headline", results))
     page.add("definitions", facts(results))
@@ -97,8 +96,7 @@ def _page(results: Results) -> Page:
     if results.learning:
         columns = results.environment.judged
         page.section("Learning curves", TEXTS["learning"])
-        chart = learning_chart(results.learning, columns, results.colours)
-        page.add("chart", page_chart(chart))
+        page.add("chart", page_chart(learning_chart(results.learning, columns, results.colours)))
         table = learning_table(results.learning, columns)
         page.add("table", table, "Table of learning curves", is_folded=True)
     page.section("Notes")
@@ -107,20 +105,20 @@ def _page(results: Results) -> Page:
 
 
 def _text(results: Results, name: str) -> str:
-    """A paragraph, with its sentence about families where there are some."""
+    """Return a paragraph, with a sentence about families of residuals if there are some."""
     return TEXTS[name] + (TEXTS[f"{name}_families"] if results.table.members else "")
 
 
 def _add_maps(page: Page, results: Results) -> None:
-    """Heat maps: who is best, what learning adds, and folded away every policy's score."""
+    """Add heat maps: the best policies, changes by learning, and (folded) all scores."""
     page.section("Maps", TEXTS["maps"].format(signs=SIGNS_ARE))
     page.add("caption", "Green: learning is ahead. Red: it is behind.")
     for heat_map in results.maps:
-        found = panels(heat_map)
+        all_panels = panels(heat_map)
         title = capital(f"{heat_map.column.title}, {heat_map.title}")
-        page.add("map", [panel for panel in found if panel.is_main], title)
-        rest = [panel for panel in found if not panel.is_main]
-        page.add("map", rest, "Scores of every policy", is_folded=True)
+        page.add("map", [panel for panel in all_panels if panel.is_main], title)
+        scores = [panel for panel in all_panels if not panel.is_main]
+        page.add("map", scores, "Scores of every policy", is_folded=True)
 
 
 def _add_ladder(page: Page, results: Results) -> None:
@@ -134,7 +132,7 @@ def _add_ladder(page: Page, results: Results) -> None:
 
 
 def _add_changes(page: Page, results: Results) -> None:
-    """Forest charts and tables of residuals; baselines in a table of their own."""
+    """Add charts and tables of changes of residuals, and a table of differences of baselines."""
     *of_residuals, (name_of_others, others) = results.grouped_changes.items()
     for name, rows in of_residuals:
         if not rows:
@@ -142,42 +140,52 @@ def _add_changes(page: Page, results: Results) -> None:
         page.section(name, TEXTS["changes"])
         page.add("caption", TEXTS["changes_colours"])
         drawn = [row for row in rows if row.is_judged] if results.has_conditions else []
-        for title, own in group_by(drawn, lambda row: row.policy).items():
-            page.add("chart", forest(own), f"{title} against {own[0].base}")
+        for title, changes in group_by(drawn, lambda row: row.policy).items():
+            page.add("chart", forest(changes), f"{title} against {changes[0].base}")
         _add_table(page, changes_table(rows, results.colours), "Table of changes")
     if others:
         page.section(name_of_others, TEXTS["differences"])
-        table = changes_table(others, results.colours)
-        _add_table(page, table, "Table of differences")
+        _add_table(page, changes_table(others, results.colours), "Table of differences")
 
 
 def _add_table(page: Page, table: Table, title: str = "Table") -> None:
-    """A table, folded away under its title where it is long."""
+    """Add a table, folded under its title if it is long."""
     number = len(table.rows)
-    is_long = number > _LONG
+    is_long = number > _MAX_OPEN_ROWS
     title = f"{title} ({number} rows)" if is_long else ""
     page.add("table", table, title, is_folded=is_long)
 
 
 def _add_curves(page: Page, results: Results) -> None:
-    """Signals of the first episodes over time, a chart for each motion and scenario."""
+    """Add the signals of first episodes over time: a chart for each motion and scenario."""
     table = results.table
-    known = table.environment
-    walk = TEXTS["curves_walk"] if known.walks else ""
+    walk = TEXTS["curves_walk"] if table.environment.walks else ""
     page.section("Curves over time", f"{_text(results, 'curves')}{walk}")
     traced = [e for e in results.evaluations if e.trace]
-    shared = _ALL_POINTS // (len(table.references) * len(table.scenarios))
-    most = min(_POINTS, max(_LEAST_POINTS, shared))
-    for number, own in enumerate(cells_together(traced)):
-        first = own[0].condition
-        policies = group_by(own, lambda e: e.condition.policy.title)
-        chart = time_chart(policies, known.curves, results.colours, most)
-        title = capital(f"{known.title(first.reference_name)}, {first.scenario}")
-        page.add("chart", page_chart(chart), title, is_folded=True, is_open=number == 0)
+    share = _TOTAL_POINTS // (len(table.references) * len(table.scenarios))
+    points = min(_MAX_POINTS, max(_MIN_POINTS, share))
+    for number, cells in enumerate(cells_together(traced)):
+        add_time_chart(page, cells, results.colours, points, is_folded=True, is_open=number == 0)
+
+
+def add_time_chart(
+    page: Page,
+    cells: Sequence[Evaluation],
+    colours: Mapping[str, str],
+    points: int,
+    **folding: bool,
+) -> None:
+    """Add the signals of all policies in one motion and scenario, with at most so many points."""
+    condition = cells[0].condition
+    environment = condition.environment
+    policies = group_by(cells, lambda e: e.condition.policy.title)
+    chart = time_chart(policies, environment.curves, colours, points)
+    title = capital(f"{environment.title(condition.reference_name)}, {condition.scenario}")
+    page.add("chart", page_chart(chart), title, **folding)
 
 
 def _add_sweeps(page: Page, results: Results) -> None:
-    """Scores over the swept option, or over what the references differ in."""
+    """Add scores over the swept option, or over the value in which the references differ."""
     columns = results.environment.judged
     charts = sweep_charts(results.evaluations, results.swept, columns, _cell_score)
     if charts:

@@ -1,1 +1,1 @@
-"""Runs: their folders, their progress, code of the user, and how failures are explained."""
+"""Runs: result folders, progress, the console, code of the user, and messages of failures."""

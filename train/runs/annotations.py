@@ -1,24 +1,24 @@
-"""Problems as annotations of GitHub's workflows, which stand at the pull request."""
+"""Annotations of GitHub's workflows, which show problems at the pull request."""
 
 import os
 from pathlib import Path
 
 
-def in_workflow() -> bool:
-    """True where a workflow of GitHub runs this program."""
+def runs_in_workflow() -> bool:
+    """Return true if a workflow of GitHub runs this program."""
     return os.environ.get("GITHUB_ACTIONS") == "true"
 
 
 def annotation(problem: str, file: Path | None = None) -> str:
-    """The command by which GitHub shows a problem at a pull request, or at a file of it.
+    """Return the command that lets GitHub show a problem at a pull request, or at a file of it.
 
-    Its escapes are those of docs.github.com, "Workflow commands": a property may hold neither
-    colons nor commas.
+    docs.github.com, "Workflow commands", lists the escapes. A property may contain neither colons
+    nor commas.
     """
     message = problem.replace("%", "%25").replace("\r", "%0D").replace("\n", "%0A")
-    place = ""
+    location = ""
     if file is not None:
-        found = os.path.relpath(file, os.environ.get("GITHUB_WORKSPACE"))
-        escaped = found.replace("%", "%25").replace(":", "%3A").replace(",", "%2C")
-        place = f"file={escaped},"
-    return f"::error {place}title=elastic::{message}"
+        path = os.path.relpath(file, os.environ.get("GITHUB_WORKSPACE"))
+        escaped = path.replace("%", "%25").replace(":", "%3A").replace(",", "%2C")
+        location = f"file={escaped},"
+    return f"::error {location}title=elastic::{message}"

@@ -1,4 +1,4 @@
-"""The terminal: whatever a text or a warning holds, nothing of it is a command."""
+"""The console of the commands: no text and no warning can send commands to the terminal."""
 
 import traceback
 import warnings
@@ -18,11 +18,11 @@ from train.runs.escaping import visible
 
 
 class PlainConsole(Console):
-    """Rich's console that shows the commands of a terminal within texts, in place of obeying them.
+    """Rich's console, which shows terminal commands within texts instead of sending them.
 
-    Texts may come from elsewhere: labels, paths, joints of a model, configurations of a folder that
-    was received. A text that is printed is no markup of Rich's either, unless `markup=True` asks
-    for it, and is one line however long it is.
+    Texts may come from others: labels, paths, joints of a model, configurations of a received
+    folder. A printed text is not read as Rich's markup, unless `markup=True`. It stays one line,
+    however long it is.
     """
 
     def __init__(self, **options: Any) -> None:
@@ -30,7 +30,7 @@ class PlainConsole(Console):
         super().__init__(emoji=False, **options)
 
     def print(self, *objects: Any, markup: bool = False, **options: Any) -> None:
-        """Print texts as they are: without markup, colours or line breaks of our own."""
+        """Print texts as they are, without markup, colours or added line breaks."""
         if all(isinstance(part, str | Text) for part in objects):
             options = {"soft_wrap": True, "highlight": False, **options}
         style = {"markup": markup, "highlight": options.get("highlight")}
@@ -43,32 +43,31 @@ class PlainConsole(Console):
     def render(
         self, renderable: RenderableType, options: ConsoleOptions | None = None
     ) -> Iterable[Segment]:
-        """Render with visible texts, and what Rich itself asks of the terminal stays."""
-        for one in super().render(renderable, options):
-            yield one if one.control else Segment(visible(one.text), one.style)
+        """Make all texts visible; Rich's own terminal commands stay."""
+        for segment in super().render(renderable, options):
+            yield segment if segment.control else Segment(visible(segment.text), segment.style)
 
 
 def can_redraw(console: Console) -> bool:
-    """True where lines can be drawn again.
+    """Return true if lines can be drawn again in place.
 
-    A notebook or a CI that asks for colours is a terminal for Rich, and shows each drawing below
-    the last one.
+    Rich treats a notebook, and a CI that asks for colours, as terminals. Both show each drawing
+    below the last one.
     """
     return console.is_terminal and console.file.isatty()
 
 
-_Row = Sequence[str]
-
-
-def make_table(title: str, head: _Row, rows: Iterable[_Row], left: int = 1, **style: Any) -> Table:
-    """A table of plain texts.
+def make_table(
+    title: str, head: Sequence[str], rows: Iterable[Sequence[str]], left: int = 1, **style: Any
+) -> Table:
+    """Return a table of plain texts.
 
     Args:
         title: Above the table.
         head: Names of the columns.
         rows: Cells.
-        left: How many of the first columns are aligned to the left; the others are numbers.
-        **style: Of Rich's table.
+        left: Number of first columns that are aligned to the left; the others are numbers.
+        **style: Options of Rich's table.
     """
     table = Table(title=escape(title), **style)
     for number, name in enumerate(head):
@@ -79,47 +78,47 @@ def make_table(title: str, head: _Row, rows: Iterable[_Row], left: int = 1, **st
 
 
 def print_files(folder: Path, files: Iterable[Path], console: Console) -> None:
-    """Say what was written."""
+    """Print the paths of the files that were written."""
     console.print(f"Results in {folder}:")
     for path in files:
         console.print(f"  {path}")
 
 
-def traceback_of(error: BaseException) -> str:
-    """The traceback of an error as text for a terminal."""
+def traceback_text(error: BaseException) -> str:
+    """Return the traceback of an error as text for a terminal."""
     return visible("".join(traceback.format_exception(error)))
 
 
 @contextmanager
 def visible_warnings() -> Iterator[None]:
-    """Warnings within are shown without commands of a terminal."""
+    """Show warnings within the context without terminal commands."""
     before = warnings.formatwarning
-    warnings.formatwarning = lambda *given: visible(before(*given))
+    warnings.formatwarning = lambda *arguments: visible(before(*arguments))
     try:
         yield
     finally:
         warnings.formatwarning = before
 
 
-_SAID: ContextVar[set[str] | None] = ContextVar("said", default=None)
+_SHOWN: ContextVar[set[str] | None] = ContextVar("shown", default=None)
 
 
 def shown_warnings() -> frozenset[str]:
-    """Texts that were shown within `warn_once`, for processes that shall not show them again."""
-    return frozenset(_SAID.get() or ())
+    """Return the warnings that `warn_once` has shown, which other processes must not repeat."""
+    return frozenset(_SHOWN.get() or ())
 
 
 @contextmanager
-def warn_once(said: Iterable[str] = ()) -> Iterator[None]:
-    """Show each warning within once.
+def warn_once(shown: Iterable[str] = ()) -> Iterator[None]:
+    """Show each warning within the context once.
 
     Args:
-        said: Texts that were shown before, such as in the process that started this one.
+        shown: Texts that were shown before, such as in the process that started this one.
     """
-    outer = _SAID.get()
-    known = {*said} if outer is None else outer
-    known.update(said)
-    token = _SAID.set(known)
+    outer = _SHOWN.get()
+    known = set[str]() if outer is None else outer
+    known.update(shown)
+    token = _SHOWN.set(known)
     before = warnings.showwarning
 
     def show(message: Warning | str, *where: Any) -> None:
@@ -132,4 +131,4 @@ def warn_once(said: Iterable[str] = ()) -> Iterator[None]:
         yield
     finally:
         warnings.showwarning = before
-        _SAID.reset(token)
+        _SHOWN.reset(token)

@@ -1,7 +1,7 @@
 """Text of a user, such as the label of a policy, in the formats of results.
 
-All outlets go through `visible`: the console, tables of CSV, Markdown and the page of a report.
-What a terminal would obey, and what turns the order of letters around, is shown as �.
+The console, CSV tables, Markdown and the page of a report all pass texts through `visible`. It
+shows terminal commands, and characters that change the direction of writing, as �.
 """
 
 import csv
@@ -17,34 +17,33 @@ from elastic_env.core.files import write_whole
 
 _FORMULA = ("=", "+", "-", "@", "\t", "\r")
 _NUMBERS = re.compile(r"[-+]?[\d.]+(e[-+]?\d+)?( [-+]?(nan|[\d.]+(e[-+]?\d+)?))*")
-"""Numbers side by side, which are no formula whatever their sign."""
-_SPACE = re.compile(r"[^\S\N{NO-BREAK SPACE}]+")
-_COMMANDS = re.compile(
-    "[\x00-\x08\x0b-\x1f\x7f-\x9f"  # controls, C0 and C1, but for tab and newline
+"""Numbers separated by spaces. They are no formula, even if they begin with a sign."""
+_WHITESPACE = re.compile(r"[^\S\N{NO-BREAK SPACE}]+")
+_CONTROLS = re.compile(
+    "[\x00-\x08\x0b-\x1f\x7f-\x9f"  # controls, C0 and C1, except tab and newline
     "\u061c\u200e\u200f\u202a-\u202e\u2066-\u2069"  # direction of writing
-    "\ud800-\udfff]"  # halves of characters, which no stream takes
+    "\ud800-\udfff]"  # single surrogates, which cannot be encoded
 )
 _LINK = re.compile(
     r"(?i)\](?=[(\[:])|(?<=http):(?=//)|(?<=https):(?=//)|(?<=ftp):(?=//)|(?<=www)\."
 )
-"""Signs of Markdown without which a text is no link and no image."""
+"""Signs of Markdown; when they are escaped, a text is neither link nor image."""
 _BACKSLASH = re.compile(r"\\(?=[!-/:-@[-`{-~])")
-"""A backslash that Markdown would take away, with what is behind it."""
-_IN_SCRIPT = {ord(sign): f"\\u{ord(sign):04x}" for sign in "<>&\u2028\u2029"}
+"""A backslash that Markdown would remove, because a sign follows it."""
+_SCRIPT_ESCAPES = {ord(sign): f"\\u{ord(sign):04x}" for sign in "<>&\u2028\u2029"}
 
 
 def visible(text: str) -> str:
-    """Text without what a terminal obeys or what turns letters around; tabs and newlines stay."""
-    return _COMMANDS.sub("�", text)
+    """Return a text without terminal commands and changes of direction; tabs and newlines stay."""
+    return _CONTROLS.sub("�", text)
 
 
 def csv_cell(value: Any) -> Any:
-    """A cell of a CSV file; text that looks like a formula gets an apostrophe in front."""
+    """Return a cell of a CSV file; text that looks like a formula gets an apostrophe in front."""
     if not isinstance(value, str):
         return value
     text = visible(value)
-    is_formula = text.startswith(_FORMULA) and not _NUMBERS.fullmatch(text)
-    return f"'{text}" if is_formula else text
+    return f"'{text}" if text.startswith(_FORMULA) and not _NUMBERS.fullmatch(text) else text
 
 
 def write_csv(head: Sequence[str], rows: Iterable[Iterable[Any]], path: Path) -> Path:
@@ -56,36 +55,35 @@ def write_csv(head: Sequence[str], rows: Iterable[Iterable[Any]], path: Path) ->
 
 
 def write_records(records: Sequence[Mapping[str, Any]], path: Path) -> Path:
-    """Write a CSV file of rows by column; what a row does not have is empty."""
+    """Write a CSV file of rows by column name; columns that a row lacks are empty."""
     head = list(dict.fromkeys(name for record in records for name in record))
-    rows = [[record.get(name, "") for name in head] for record in records]
-    return write_csv(head, rows, path)
+    return write_csv(head, [[record.get(name, "") for name in head] for record in records], path)
 
 
 def markdown_text(text: str) -> str:
-    """Plain text in Markdown, in one line, also within a table; no-break spaces stay.
+    """Return plain text as one line of Markdown, also within a table; no-break spaces stay.
 
-    Neither tags nor links nor images are made of it.
+    The text becomes neither tags nor links nor images.
     """
-    line = _SPACE.sub(" ", visible(text)).strip()
+    line = _WHITESPACE.sub(" ", visible(text)).strip()
     line = _BACKSLASH.sub(r"\\\\", line)
     return html.escape(_LINK.sub(_escape, line), quote=False).replace("|", "\\|")
 
 
-def _escape(found: re.Match[str]) -> str:
-    """A sign of Markdown as text."""
-    sign = found[0]
+def _escape(match: re.Match[str]) -> str:
+    """Return a sign of Markdown as text."""
+    sign = match[0]
     return f"{sign}\\" if sign == "]" else f"\\{sign}"
 
 
 def script_json(value: Any) -> str:
-    """JSON within a script element: nothing in it ends the element or begins a comment."""
-    plain = {"ensure_ascii": False, "separators": (",", ":"), "allow_nan": False}
-    return json.dumps(_visible_data(value), **plain).translate(_IN_SCRIPT)
+    """Return JSON for a script element; nothing in it ends the element or begins a comment."""
+    options = {"ensure_ascii": False, "separators": (",", ":"), "allow_nan": False}
+    return json.dumps(_visible_data(value), **options).translate(_SCRIPT_ESCAPES)
 
 
 def _visible_data(value: Any) -> Any:
-    """Plain data whose texts are visible."""
+    """Return plain data with visible texts."""
     if isinstance(value, str):
         return visible(value)
     if isinstance(value, dict):
@@ -95,15 +93,15 @@ def _visible_data(value: Any) -> Any:
 
 
 def template_value(value: Any) -> Any:
-    """A value for a page: plain text is made visible; HTML of a template is a type of its own."""
+    """Return a value for a page: plain text becomes visible; HTML has a type of its own."""
     return visible(value) if type(value) is str else value
 
 
 def line_value(value: Any) -> Any:
-    """A value for sentences, of which a blank line ends one: text is visible and in one line."""
+    """Return a value for sentences, which blank lines separate: text becomes one visible line."""
     return visible(value).replace("\n", " ") if isinstance(value, str) else value
 
 
 def chart_text(text: str) -> str:
-    """Plain text in a chart, whose texts are HTML."""
+    """Return plain text for a chart, whose texts are HTML."""
     return html.escape(visible(text), quote=False)

@@ -1,10 +1,10 @@
-"""Text of a failure, and the exit code of `elastic`: one sentence each, from one place.
+"""Messages of failures, one sentence each, and exit codes of `elastic`.
 
 | exit code | meaning |
 |---|---|
 | 0 | fine |
 | 1 | `elastic bench` alone: a figure is worse than accepted |
-| 2 | a wrong input: configuration, name, option, a policy of the user's that fails |
+| 2 | a wrong input: configuration, name, option, a user's policy that fails |
 | 3 | the system failed: disk, memory, process, port |
 | 70 | a defect of this program, with its traceback |
 | 128 + n | ended by signal n |
@@ -38,15 +38,15 @@ _CURES = {
     errno.EACCES: "name a folder that can be written, by --output",
 }
 
-_NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+_FULL_DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
-class EndedError(KeyboardInterrupt):
-    """A signal that asks to end; all is done for it that is done at Ctrl-C, such as torque off."""
+class SignalError(KeyboardInterrupt):
+    """A signal that ends the program; everything happens as at Ctrl-C, such as torque off."""
 
 
 def explain(error: BaseException) -> tuple[str, int] | None:
-    """Sentence and exit code of a failure; None for a defect, which needs its traceback."""
+    """Return message and exit code of a failure; None for a defect, which needs its traceback."""
     if isinstance(error, ShadowedError):
         return str(error), WRONG_INPUT
     from elastic_env.core.errors import ElasticError, missing_extra, shorten
@@ -69,35 +69,38 @@ def explain(error: BaseException) -> tuple[str, int] | None:
 
 
 def is_interrupt(error: BaseException) -> bool:
-    """True if it is Ctrl-C, which a loading module or a call of C may turn into another error."""
-    return any(map(_is_of_ctrl_c, _causes(error)))
+    """Return true for Ctrl-C, which a loading module or a call of C may turn into another error."""
+    return any(map(_names_interrupt, _causes(error)))
 
 
-def _is_of_ctrl_c(error: BaseException) -> bool:
-    """True if it is, or if `ctypes` met it while it converted an argument, and quotes it."""
+def _names_interrupt(error: BaseException) -> bool:
+    """Return true for an interrupt, or an error of `ctypes` that quotes one.
+
+    An interrupt during the conversion of an argument becomes such an error.
+    """
     if isinstance(error, ctypes.ArgumentError):
-        return re.search("KeyboardInterrupt|EndedError", str(error)) is not None
+        return re.search("KeyboardInterrupt|SignalError", str(error)) is not None
     return isinstance(error, KeyboardInterrupt)
 
 
-def is_unread(error: BaseException) -> bool:
-    """True if it comes from a pipe whose reader has gone, such as `head`."""
+def is_closed_pipe(error: BaseException) -> bool:
+    """Return true if an error comes from a pipe whose reader has ended, such as `head`."""
     return any(isinstance(cause, BrokenPipeError) for cause in _causes(error))
 
 
-def is_full(error: BaseException) -> bool:
-    """True if it comes from a disk, a quota or a limit on files that leaves no room."""
-    causes = [cause for cause in _causes(error) if isinstance(cause, OSError)]
-    return any(cause.errno in _NO_ROOM for cause in causes)
+def is_disk_full(error: BaseException) -> bool:
+    """Return true if an error comes from a full disk, a quota or a limit on the size of files."""
+    return any(isinstance(e, OSError) and e.errno in _FULL_DISK_ERRORS for e in _causes(error))
 
 
 def _extra_of(error: ModuleNotFoundError) -> str:
+    """Return the extra that installs a missing module; empty if none does."""
     package = str(error.name).split(".")[0]
     return next((extra for extra in _EXTRAS if package in _EXTRAS[extra]), "")
 
 
 def _causes(error: BaseException | None) -> Iterator[BaseException]:
-    """An error and what it came from."""
+    """Yield an error and the errors that it came from."""
     while error is not None:
         yield error
         error = error.__cause__ or error.__context__

@@ -1,6 +1,5 @@
 """Result folders: never overwritten, each with configuration, seed, versions and commit."""
 
-import contextlib
 import errno
 import fcntl
 import itertools
@@ -11,7 +10,7 @@ import stat
 import subprocess
 import time
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
@@ -29,23 +28,25 @@ from elastic_env.core.json_text import LARGEST_JSON
 from elastic_env.core.yaml_text import yaml_of
 
 RUNS = Path("runs")
-"""Folder of results unless one is named."""
+"""Folder of results, unless the user names one."""
 
 CONFIG = "config.yaml"
 """File of a run with its resolved configuration."""
 _METADATA = "metadata.json"
 _LOCK = ".lock"
+_DESCRIPTION_FILES = {CONFIG, _METADATA, _LOCK}
+"""Files of a run that are no results."""
 _RETRY_S = 0.2
-_LONGEST_HOLDER = 200
-"""Characters of a lock that say who holds it."""
-_RECORDED = "elastic-env mujoco gymnasium pin numpy scipy stable-baselines3 torch"
+_HOLDER_CHARACTERS = 200
+"""Longest text that is read from a lock file [characters]; it names the process."""
+_RECORDED_PACKAGES = "elastic-env mujoco gymnasium pin numpy scipy stable-baselines3 torch"
 """Packages whose versions a run records."""
 
 
-def describe(folder: Path, configuration: dict[str, Any], seed: int | None) -> None:
+def record_run(folder: Path, configuration: dict[str, Any], seed: int | None) -> None:
     """Write configuration (`config.yaml`), first seed, versions and commit (`metadata.json`).
 
-    Results of another configuration, which the folder has recorded, are removed.
+    If the folder has another configuration, its recorded results are removed.
     """
     text = yaml_of(configuration)
     results = _recorded_results(folder)
@@ -58,7 +59,7 @@ def describe(folder: Path, configuration: dict[str, Any], seed: int | None) -> N
 
 
 def record_results(folder: Path, files: Iterable[Path]) -> None:
-    """Record what a run has written, so that it goes where the run goes on with another one."""
+    """Record the files of a run, which are removed if it continues with another configuration."""
     content = json.loads((folder / _METADATA).read_text(encoding="utf-8"))
     _write_metadata(folder, content, sorted(file.name for file in files))
 
@@ -69,64 +70,64 @@ def _write_metadata(folder: Path, content: dict[str, Any], results: list[str]) -
 
 
 def _recorded_results(folder: Path) -> list[str]:
-    """Names of files in a folder, which may come from anybody."""
+    """Return the names of recorded files in a folder, which may come from anybody."""
     try:
-        found = read_json(folder / _METADATA, LARGEST_JSON, missing=str)
+        content = read_json(folder / _METADATA, LARGEST_JSON, missing=str)
     except ConfigurationError:
         return []
-    results = found.get("results") if isinstance(found, dict) else None
-    named = results if isinstance(results, list) else []
+    results = content.get("results") if isinstance(content, dict) else None
+    recorded = results if isinstance(results, list) else []
     present = {file.name for file in folder.iterdir() if file.is_file()}
-    return sorted(name for name in present - {CONFIG, _METADATA, _LOCK} if name in named)
+    return sorted(name for name in present - _DESCRIPTION_FILES if name in recorded)
 
 
 def require_run(folder: Path) -> Path:
-    """The file with the configuration of a run that is gone on with.
+    """Return the configuration file of a run that is to be continued.
 
     Raises:
-        ConfigurationError: The folder has no configuration, or something in it is a link that leads
-            out of it, or neither a file nor a folder.
+        ConfigurationError: The folder has no configuration, or contains a link that leads out of
+            it, or something that is neither a file nor a folder.
     """
     file = folder / CONFIG
     if not file.is_file():
         problem = f"{folder} is no run: it has no {CONFIG}; name a run's folder"
         raise ConfigurationError(problem)
-    for place, folders, files in os.walk(folder):
+    for parent, folders, files in os.walk(folder):
         for name in (*folders, *files):
-            path = Path(place, name)
-            kind = path.lstat().st_mode
-            if stat.S_ISLNK(kind) and leads_out(path, folder):
+            path = Path(parent, name)
+            mode = path.lstat().st_mode
+            if stat.S_ISLNK(mode) and leads_out(path, folder):
                 raise ConfigurationError(
                     f"{path} is a link that leads out of {folder}, where nothing is to be changed;"
                     " remove it"
                 )
-            if not (stat.S_ISLNK(kind) or stat.S_ISREG(kind) or stat.S_ISDIR(kind)):
+            if not (stat.S_ISLNK(mode) or stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
                 problem = f"{path} is neither a file nor a folder, as all of a run are; remove it"
                 raise ConfigurationError(problem)
     return file
 
 
-def free_folder(name: str, output: Path | None = None) -> Path:
-    """A new folder for results: the one that is named, or runs/<name>, numbered if taken.
+def create_folder(name: str, output: Path | None = None) -> Path:
+    """Create a folder for results: `output`, or runs/<name> with a number if that exists.
 
-    It is made in one step, so that of several programs each gets another one.
+    Programs that run at the same time get different folders.
 
     Raises:
-        ConfigurationError: The name is no name of a folder.
-        ResultsExistError: The named folder is not empty.
+        ConfigurationError: The name is not one folder's name.
+        ResultsExistError: `output` is not empty.
         SystemFailedError: The folder cannot be made.
     """
-    place = RUNS if output is None else output
     try:
-        return _next_free(require_name(name)) if output is None else _empty(output)
+        return _numbered_folder(require_name(name)) if output is None else _empty_folder(output)
     except OSError as error:
+        place = RUNS if output is None else output
         cause = f"{shorten(error.filename or place)}: {error.strerror or error}"
         problem = f"no folder for results can be made at {shorten(place)} ({cause})"
         raise SystemFailedError(f"{problem}; name one by --output") from None
 
 
 def require_name(name: str) -> str:
-    """A name that is one folder's name and leads nowhere else.
+    """Return a name if it is the name of one folder, without a path.
 
     Raises:
         ConfigurationError: It is not.
@@ -141,23 +142,23 @@ def require_name(name: str) -> str:
 
 @contextmanager
 def lock_run(folder: Path, patience_s: float = 0.0) -> Iterator[None]:
-    """Keep other programs from a run for as long as this one works on it; a kill frees it.
+    """Lock a run, so that no other program works on it; if this program is killed, the lock ends.
 
     Args:
-        folder: Of the run.
-        patience_s: How long another program is waited for [s].
+        folder: Folder of the run.
+        patience_s: Longest time to wait for another program [s].
 
     Raises:
-        ConfigurationError: Another program works on it, or the lock is no file of its own.
+        ConfigurationError: Another program works on the run, or the lock is not a plain file.
     """
     with _open_lock(folder / _LOCK) as file:
-        last = time.monotonic() + patience_s
+        deadline = time.monotonic() + patience_s
         while True:
-            with contextlib.suppress(BlockingIOError):
+            with suppress(BlockingIOError):
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 break
-            if time.monotonic() >= last:
-                holder = file.read(_LONGEST_HOLDER).strip() or "unknown"
+            if time.monotonic() >= deadline:
+                holder = file.read(_HOLDER_CHARACTERS).strip() or "unknown"
                 problem = f"another program, process {holder}, works on {folder}"
                 cure = "wait until it has ended, or end it"
                 raise ConfigurationError(f"{problem}; {cure}")
@@ -169,26 +170,26 @@ def lock_run(folder: Path, patience_s: float = 0.0) -> Iterator[None]:
 
 
 def _open_lock(path: Path) -> TextIO:
-    """The file of a lock, for reading and writing; a link, a pipe or a file of two names is none.
+    """Open the file of a lock for reading and writing.
 
     Raises:
-        ConfigurationError: It is one of these.
+        ConfigurationError: It is a link, a pipe, or a file with several names.
     """
     flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
     try:
         descriptor = os.open(path, flags, 0o666)
     except OSError as error:
         if error.errno in (errno.ELOOP, errno.EISDIR, errno.ENXIO):
-            raise _no_lock(path) from None
+            raise _lock_error(path) from None
         raise
-    found = os.fstat(descriptor)
-    if not stat.S_ISREG(found.st_mode) or found.st_nlink != 1:
+    status = os.fstat(descriptor)
+    if not stat.S_ISREG(status.st_mode) or status.st_nlink != 1:
         os.close(descriptor)
-        raise _no_lock(path)
+        raise _lock_error(path)
     return os.fdopen(descriptor, "r+", encoding="utf-8", errors="replace")
 
 
-def _no_lock(path: Path) -> ConfigurationError:
+def _lock_error(path: Path) -> ConfigurationError:
     return ConfigurationError(
         f"{path} must be a plain file with one name, it is a link or something else; remove it"
     )
@@ -196,17 +197,17 @@ def _no_lock(path: Path) -> ConfigurationError:
 
 @contextmanager
 def lock_part(folder: Path, patience_s: float) -> Iterator[None]:
-    """`lock_run` for a part of a run, whose folder is made, and removed without a result."""
+    """Make the folder of a part of a run and lock it; a failure without a result removes it."""
     folder.mkdir(parents=True, exist_ok=True)
-    with lock_run(folder, patience_s), _removed_without_result(folder):
+    with lock_run(folder, patience_s), _remove_without_result(folder):
         yield
 
 
 @contextmanager
-def own_folder(name: str, output: Path | None = None) -> Iterator[Path]:
-    """`free_folder` for the work within, removed if that fails without a result."""
-    folder = free_folder(name, output)
-    with _removed_without_result(folder):
+def result_folder(name: str, output: Path | None = None) -> Iterator[Path]:
+    """Create a folder as `create_folder` does, and remove it if the work fails without a result."""
+    folder = create_folder(name, output)
+    with _remove_without_result(folder):
         yield folder
 
 
@@ -214,41 +215,42 @@ def own_folder(name: str, output: Path | None = None) -> Iterator[Path]:
 def run_folder(
     name: str, recorded: dict[str, Any], seed: int | None, output: Path | None = None
 ) -> Iterator[Path]:
-    """`own_folder` for a new run, described; arguments as there and in `describe`."""
-    with own_folder(name, output) as folder:
-        describe(folder, recorded, seed)
+    """Create a `result_folder` for a new run, and record its configuration as `record_run` does."""
+    with result_folder(name, output) as folder:
+        record_run(folder, recorded, seed)
         yield folder
 
 
 @contextmanager
-def _removed_without_result(folder: Path) -> Iterator[None]:
-    """Remove a folder that holds nothing but what describes it, if the work within fails."""
+def _remove_without_result(folder: Path) -> Iterator[None]:
+    """Remove a folder if the work within the context fails and the folder has no results."""
     try:
         yield
     except BaseException:
         files = list(folder.iterdir())
-        if {file.name for file in files} <= {CONFIG, _METADATA, _LOCK}:
+        if {file.name for file in files} <= _DESCRIPTION_FILES:
             for file in files:
                 file.unlink()
             folder.rmdir()
             if folder.parent == RUNS:
-                with contextlib.suppress(OSError):  # it holds other runs
+                with suppress(OSError):  # it contains other runs
                     RUNS.rmdir()
         raise
 
 
-def _next_free(name: str) -> Path:
-    """runs/<name>, or the first of its numbers that is free; `mkdir` makes it for one program."""
+def _numbered_folder(name: str) -> Path:
+    """Make runs/<name>, or runs/<name>-<number>; `mkdir` succeeds for one program only."""
     RUNS.mkdir(parents=True, exist_ok=True)
     for number in itertools.count(1):
         folder = RUNS / (name if number == 1 else f"{name}-{number}")
-        with contextlib.suppress(FileExistsError):
+        with suppress(FileExistsError):
             folder.mkdir()
             return folder
     raise AssertionError
 
 
-def _empty(folder: Path) -> Path:
+def _empty_folder(folder: Path) -> Path:
+    """Make a folder, or check that it is empty."""
     if folder.exists() and not folder.is_dir():
         cure = "name a folder that is new or empty"
         raise ResultsExistError(f"{shorten(folder)} is a file; {cure}")
@@ -262,19 +264,19 @@ def _empty(folder: Path) -> Path:
 
 
 def provenance(seed: int | None) -> dict[str, Any]:
-    """When, from which commit and with which versions something is made."""
+    """Return date, seed, commit, platform and versions of packages, for the record of a result."""
     return {
         "created": datetime.now(UTC).isoformat(timespec="seconds"),
         "seed": seed,
         "commit": _commit(),
         "python": platform.python_version(),
         "platform": platform.platform(),
-        "versions": {name: installed_version(name) for name in _RECORDED.split()},
+        "versions": {name: installed_version(name) for name in _RECORDED_PACKAGES.split()},
     }
 
 
 def installed_version(package: str) -> str | None:
-    """Version of a package; None where it is not installed."""
+    """Return the version of a package; None if it is not installed."""
     try:
         return metadata.version(package)
     except metadata.PackageNotFoundError:
@@ -282,7 +284,7 @@ def installed_version(package: str) -> str | None:
 
 
 def _commit() -> str | None:
-    """Commit of the source tree, with a + for uncommitted changes; None outside a repository."""
+    """Return the commit of the source tree, with a + for changes; None outside a repository."""
     command = ["git", "describe", "--always", "--abbrev=40", "--exclude=*", "--dirty=+"]
     options: Any = {"cwd": Path(__file__).parent, "text": True, "timeout": 10}
     options["stderr"] = subprocess.DEVNULL

@@ -1,9 +1,9 @@
-"""The path of imports: what is installed, and the working folder last where a name asks for it.
+"""Import path: installed packages, and the working folder last if the user names code in it.
 
-Python puts the working folder, or a script's own, first: a user's `train.py` would then stand
-before our package, and a `multiprocessing.py` before the standard library, also in each process
-that is started. Behind everything else, it would still be searched for plug-ins of installed
-packages, whose code would run.
+Python puts the working folder, or the folder of a script, first. A user's `train.py` would then
+replace our package, and a `multiprocessing.py` the standard library, also in child processes. Even
+in last place the working folder would be searched for plug-ins of installed packages, and their
+code would run. So it is on the path only if the user names a module.
 """
 
 import importlib.util
@@ -14,63 +14,56 @@ from contextlib import contextmanager
 from pathlib import Path
 
 _ROOT = Path(__file__).resolve().parents[2]
-_OURS = ("elastic_env", "baselines", "train")
-_SAFE = "PYTHONSAFEPATH"
+_PACKAGES = ("elastic_env", "baselines", "train")
+_SAFE_PATH = "PYTHONSAFEPATH"
 
 
 class ShadowedError(ImportError):
-    """A file of the user stands before one of our packages."""
+    """A file of the user would be imported instead of one of our packages."""
 
 
-def leave(folder: Path) -> None:
-    """Look for no modules in a folder.
-
-    Args:
-        folder: The working folder.
+def remove_from_path(folder: Path) -> None:
+    """Take the working folder from the import path.
 
     Raises:
-        ShadowedError: Another entry of the path has a file that stands before a package of ours.
+        ShadowedError: Another entry of the path has a file with the name of one of our packages.
     """
     here = os.path.realpath(folder)
     others = [entry for entry in sys.path if os.path.realpath(entry or ".") != here]
-    root = str(_ROOT)  # an editable installation is found behind the whole path
+    root = str(_ROOT)  # the finder of an editable installation comes after the whole path
     sys.path[:] = others if root in others else [*others, root]
-    _require_ours()
+    _require_own_packages()
 
 
-def look_last_in(folder: Path) -> None:
-    """Look for modules in a folder too, behind everything else, unless it is on the path.
-
-    Args:
-        folder: The working folder, from which the user names a module.
-    """
+def append_to_path(folder: Path) -> None:
+    """Append the working folder, in which the user names a module, unless it is on the path."""
     here = os.path.realpath(folder)
     if all(os.path.realpath(entry or ".") != here for entry in sys.path):
         sys.path.append(str(folder))
 
 
-def _require_ours() -> None:
-    for name in _OURS:
+def _require_own_packages() -> None:
+    for name in _PACKAGES:
         spec = importlib.util.find_spec(name)
-        own = _ROOT / name / "__init__.py"
+        expected = _ROOT / name / "__init__.py"
         origin = spec and spec.origin
-        found = Path(origin).resolve() if origin else None
-        if found != own:
+        file = Path(origin).resolve() if origin else None
+        if file != expected:
             raise ShadowedError(
-                f"{found or name} stands in the place of the package {name} of elastic-env,"
-                f" {own.parent}; rename it, or take its folder out of PYTHONPATH"
+                f"{file or name} stands in the place of the package {name} of elastic-env,"
+                f" {expected.parent}; rename it, or take its folder out of PYTHONPATH"
             )
 
 
 @contextmanager
-def safe_children() -> Iterator[None]:
-    """Processes of Python that start within do not look for modules in the working folder first."""
-    before = os.environ.get(_SAFE)
-    os.environ[_SAFE] = "1"
+def isolate_children() -> Iterator[None]:
+    """Keep Python processes that start within from importing from the working folder first."""
+    before = os.environ.get(_SAFE_PATH)
+    os.environ[_SAFE_PATH] = "1"
     try:
         yield
     finally:
         if before is None:
-            del os.environ[_SAFE]
+            del os.environ[_SAFE_PATH]
         else:
-            os.environ[_SAFE] = before
+            os.environ[_SAFE_PATH] = before

@@ -1,7 +1,7 @@
-"""Presets: configurations that come with the package, each known by the name of its file.
+"""Presets: configurations that come with the package, named after their files.
 
-They lie in the folder `configs` of a checkout, to which `train/presets` is a link. The installed
-package holds copies of them in that place.
+In a checkout they are in the folder `configs`, to which `train/presets` is a link. The installed
+package has copies of them in `train/presets`.
 """
 
 import difflib
@@ -14,70 +14,69 @@ from rich.console import Console
 from elastic_env.core.config import read_mapping
 from elastic_env.core.errors import ConfigurationError, quote, shorten
 from train.runs.console import make_table
-from train.runs.user_code import TELLING, kind_of
+from train.runs.user_code import KINDS, kind_of
 
 _SENTENCE = re.compile(r".+?[.?:](?=\s[A-Z`]|$)")
-"""The first sentence of a text; Fig. 6 does not end one."""
+"""The first sentence of a text; the dot of "Fig. 6" does not end it."""
 
 
 def presets() -> dict[str, Path]:
-    """Files of all presets, by name."""
+    """Return the files of all presets, by name."""
     folder = Path(str(resources.files("train") / "presets"))
     return {file.stem: file for file in sorted(folder.glob("*.yaml"))}
 
 
-def find_configuration(given: Path, kind: str) -> Path:
-    """The file that a user means: one of their own, else the preset of that name.
+def find_configuration(path: Path, kind: str) -> Path:
+    """Return the file that a user names: their own file, else the preset of that name.
 
     Args:
-        given: Path of a file, or name of a preset.
-        kind: Of the configuration, one of `TELLING`.
+        path: Path of a file, or name of a preset.
+        kind: Kind of the configuration, one of `KINDS`.
 
     Raises:
-        ConfigurationError: There is neither; presets of a similar name are named.
+        ConfigurationError: Neither exists; the message lists presets with similar names.
     """
-    if given.exists() and not given.is_dir():
-        return given
-    known = presets()
-    name = str(given)
-    if name in known:
-        return known[name]
-    command = TELLING[kind][0]
-    if given.stem in known and not given.exists():
-        cure = f"the preset of this name needs no path: {command} {given.stem}"
-        raise ConfigurationError(f"no configuration file at {shorten(given)}; {cure}")
-    if given.suffix or given.name != name or given.exists():
-        return given  # a path, and reading it says what is wrong
-    close = difflib.get_close_matches(name, _of_kind(kind), n=3)
+    if path.exists() and not path.is_dir():
+        return path
+    files = presets()
+    name = str(path)
+    if name in files:
+        return files[name]
+    command = KINDS[kind][0]
+    if path.stem in files and not path.exists():
+        cure = f"the preset of this name needs no path: {command} {path.stem}"
+        raise ConfigurationError(f"no configuration file at {shorten(path)}; {cure}")
+    if path.suffix or path.name != name or path.exists():
+        return path  # whoever reads it raises the error
+    close = difflib.get_close_matches(name, _presets_of_kind(kind), n=3)
     similar = f"similar presets are {', '.join(close)}; " if close else ""
     problem = f"no file and no preset is called {quote(name)}"
     raise ConfigurationError(f"{problem}; {similar}{command} --list shows all of them")
 
 
 def print_presets(kind: str, console: Console) -> None:
-    """List the presets of a kind, with what the first sentence in each says.
+    """Print the presets of a kind, each with its first sentence.
 
     Args:
-        kind: One of `TELLING`.
-        console: Where the list goes.
+        kind: One of `KINDS`.
+        console: Console for the list.
     """
-    found = _of_kind(kind)
-    rows = [(name, first_sentence(file)) for name, file in found.items()]
-    command = TELLING[kind][0]
+    files = _presets_of_kind(kind)
+    rows = [(name, first_sentence(file)) for name, file in files.items()]
+    command = KINDS[kind][0]
     console.print(make_table(f"{command} NAME", ("name", "what it is"), rows, left=2))
-    folder = next(iter(found.values())).parent
+    folder = next(iter(files.values())).parent
     console.print(f"To change one, copy it from {folder}, and name the copy.")
 
 
 def first_sentence(file: Path) -> str:
-    """The first sentence of the comment that a preset begins with."""
+    """Return the first sentence of the comment at the beginning of a preset."""
     comment = re.match(r"(?:#.*\n)+", file.read_text(encoding="utf-8"))
     text = " ".join(re.sub(r"^#", "", comment[0] if comment else "", flags=re.MULTILINE).split())
-    found = _SENTENCE.match(text)
-    return (found[0] if found else text).rstrip(":")
+    match = _SENTENCE.match(text)
+    return (match[0] if match else text).rstrip(":")
 
 
-def _of_kind(kind: str) -> dict[str, Path]:
-    """The presets of a kind, by name."""
-    known = presets().items()
-    return {name: file for name, file in known if kind_of(read_mapping(file)) == kind}
+def _presets_of_kind(kind: str) -> dict[str, Path]:
+    """Return the presets of a kind, by name."""
+    return {name: file for name, file in presets().items() if kind_of(read_mapping(file)) == kind}

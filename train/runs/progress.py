@@ -1,77 +1,74 @@
-"""How far long work is: bars on a terminal, a line now and then in a log."""
+"""Progress of long work: bars on a terminal, a line from time to time in a log."""
 
-import contextlib
 import logging
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 
 from rich import progress
 from rich.console import Console
 
 from train.runs.console import can_redraw
 
-_LEAST_S = 10.0
-"""Time between two lines of progress in a log [s]; shorter work says nothing."""
-_ANNOUNCED_S = 3.0
-_LONG_S = 30.0
-"""When the time to go is said, and from how much on [s]."""
-
+_LINE_INTERVAL_S = 10.0
+"""Shortest time between two lines in a log [s]; shorter work prints no line."""
+_ESTIMATE_AFTER_S = 3.0
+"""Time after which the remaining time of long work is estimated [s]."""
+_LONG_WORK_S = 30.0
+"""Remaining time above which work is long, and the estimate is printed [s]."""
 
 _COMPILER = logging.getLogger("elastic_env.core.compiled")
 
-
 Show = Callable[..., None]
-"""Takes the number of a task, how much of it has been done, and a note, such as how many calls are
-running.
+"""Takes the number of a task, its amount of finished work, and a note, such as the number of
+running calls.
 """
 
 
 def plain_progress(
-    console: Console, least_s: float = 0.0, unit: str = "work"
+    console: Console, interval_s: float = 0.0, unit: str = "work"
 ) -> Callable[..., None]:
-    """A function that takes share of the work, 0 to 1, and note, and prints each tenth in a line.
+    """Return a function that takes a share of the work, 0 to 1, and a note, and prints each tenth.
 
-    Long work is announced early, with the time that it will take. A line with a note ends with the
-    time to go.
+    The remaining time of long work is printed early. A line with a note also has the remaining
+    time.
 
-    For work beside a control loop and work that is timed, from which the thread of a bar would take
-    time, and for logs.
+    It serves logs, control loops and timed work; the thread of a bar would delay the last two.
 
     Args:
-        console: Where it says so.
-        least_s: Shortest time between two lines, and before the first one [s].
-        unit: What is counted, such as control steps; a line with a note names it, since the note
-            counts others.
+        console: Console for the lines.
+        interval_s: Shortest time between two lines, and before the first one [s].
+        unit: Unit of the work, such as control steps. Lines with a note name it, since the note
+            counts something else.
     """
-    said = 0
-    when = time.monotonic()
-    first: tuple[float, float] | None = None  # processes take their time to start
-    is_announced = False
+    printed_tenths = 0
+    printed_s = time.monotonic()
+    first: tuple[float, float] | None = None  # processes need time to start
+    is_estimated = False
 
-    def say(share: float, note: str = "") -> None:
-        nonlocal said, when, first, is_announced
+    def show(share: float, note: str = "") -> None:
+        nonlocal printed_tenths, printed_s, first, is_estimated
         if share <= 0.0:
             return
         first = first or (time.monotonic(), share)
-        elapsed = time.monotonic() - first[0]
+        elapsed_s = time.monotonic() - first[0]
         done = share - first[1]
-        to_go = elapsed * (1.0 - share) / done if done > 0.0 else 0.0
-        if not is_announced and done > 0.0 and elapsed > _ANNOUNCED_S:
-            is_announced = True
-            if to_go > _LONG_S:
-                console.print(f"  about {duration(to_go)} to go")
-        if int(10 * share) > said and time.monotonic() - when >= least_s:
-            said = int(10 * share)
-            when = time.monotonic()
-            more = f" of the {unit}, about {duration(to_go)} to go; {note}"
-            console.print(f"  {10 * said} %{more if note else ''}")
+        remaining_s = elapsed_s * (1.0 - share) / done if done > 0.0 else 0.0
+        if not is_estimated and done > 0.0 and elapsed_s > _ESTIMATE_AFTER_S:
+            is_estimated = True
+            if remaining_s > _LONG_WORK_S:
+                console.print(f"  about {duration(remaining_s)} to go")
+        if int(10 * share) > printed_tenths and time.monotonic() - printed_s >= interval_s:
+            printed_tenths = int(10 * share)
+            printed_s = time.monotonic()
+            details = f" of the {unit}, about {duration(remaining_s)} to go; {note}"
+            console.print(f"  {10 * printed_tenths} %{details if note else ''}")
 
-    return say
+    return show
 
 
 def duration(seconds: float) -> str:
-    """A time in words, rounded to what matters: 40 s, 3 min, 2 h."""
+    """Return a rounded time in words: 40 s, 3 min, 2 h."""
     for unit, size in (("h", 3600.0), ("min", 60.0)):
         if seconds >= 1.5 * size:
             return f"{seconds / size:.0f} {unit}"
@@ -82,24 +79,24 @@ def duration(seconds: float) -> str:
 def show_progress(
     console: Console, totals: Mapping[str, int], transient: bool = False, unit: str = "work"
 ) -> Iterator[Show]:
-    """Show the progress of tasks: by a bar each on a terminal, else by a line now and then.
+    """Show the progress of tasks: a bar for each on a terminal, else a line from time to time.
 
     Args:
-        console: Where it is shown.
-        totals: What is to be done of every task, by its name.
-        transient: Whether the bars vanish at the end.
-        unit: See `plain_progress`.
+        console: Console for bars or lines.
+        totals: Amount of work of every task, by its name.
+        transient: Remove the bars at the end.
+        unit: Unit of the work, see `plain_progress`.
 
     Yields:
-        A function that takes the number of a task, how much of it has been done, and a note.
+        A function that takes the number of a task, its amount of finished work, and a note.
     """
     if not can_redraw(console):
-        say = plain_progress(console, _LEAST_S, unit)
+        show = plain_progress(console, _LINE_INTERVAL_S, unit)
         done = [0] * len(totals)
 
         def count(number: int, amount: int, note: str = "") -> None:
             done[number] = amount
-            say(sum(done) / sum(totals.values()), note)
+            show(sum(done) / sum(totals.values()), note)
 
         yield count
         return
@@ -112,8 +109,7 @@ def show_progress(
         progress.TextColumn("{task.fields[note]}", markup=False),
     )
     with progress.Progress(*columns, console=console, transient=transient) as bar:
-        begun = {"start": False, "note": ""}
-        tasks = [bar.add_task(name, total=totals[name], **begun) for name in totals]
+        tasks = [bar.add_task(name, start=False, total=n, note="") for name, n in totals.items()]
 
         def draw(number: int, amount: int, note: str = "") -> None:
             bar.start_task(tasks[number])
@@ -123,20 +119,17 @@ def show_progress(
 
 
 @contextmanager
-def say_what_is_compiled(console: Console) -> Iterator[None]:
-    """Say in one line that functions are compiled, when the first one is; nothing if none is.
-
-    Args:
-        console: Where it is said.
-    """
-    said: list[str] = []
+def announce_compilation(console: Console) -> Iterator[None]:
+    """Print one line when the first function is compiled within the context."""
+    is_announced = False
 
     def show(record: logging.LogRecord) -> bool:
-        if not said:
-            said.append(record.getMessage())
-            # nobody reads: no reason to end what is compiled
-            with contextlib.suppress(OSError):
-                console.print(said[0], soft_wrap=True)
+        nonlocal is_announced
+        if not is_announced:
+            is_announced = True
+            # a closed console must not stop the compilation
+            with suppress(OSError):
+                console.print(record.getMessage(), soft_wrap=True)
         return True
 
     level = _COMPILER.level

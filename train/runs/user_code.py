@@ -1,9 +1,9 @@
-"""Code of the user that a name stands for: "module:function", or "FILE.py:function".
+"""Code of the user, named as "module:function" or "FILE.py:function".
 
-Naming it runs it: that is what the name is for. Nothing else of a configuration or a residual
-folder runs code. A configuration that was found, as in the folder of a run, and not named by the
-user, is read by `load_without_code`: all imports go through `named_object`, which then imports
-nothing. One that is given to the wrong command is recognised by `is_a`.
+If the user names such code, it runs. Nothing else in a configuration or a residual folder runs
+code. `load_without_code` reads a configuration that the user did not name, as in the folder of a
+run. All imports use `named_object`, which imports nothing during that. `kind_check` notices a
+configuration that is for another command.
 """
 
 import importlib
@@ -21,9 +21,9 @@ from typing import Any, TypeVar
 from elastic_env.core.config import Model, load_yaml
 from elastic_env.core.errors import ConfigurationError, quote, shorten, unknown_name
 from train.runs.folders import require_run
-from train.runs.import_path import look_last_in
+from train.runs.import_path import append_to_path
 
-TELLING = {
+KINDS = {
     "comparison": (
         "elastic compare",
         "references policies episodes scenario_episodes reference_scenarios figure_policies sweep"
@@ -36,31 +36,30 @@ TELLING = {
     ),
     "bench": ("elastic bench", "cases margin"),
 }
-"""Command of each kind, and keys that no other kind has."""
+"""Kinds of configurations: the command of each, and the keys that no other kind has."""
 
 
 def kind_of(values: Mapping[str, Any]) -> str:
-    """The kind of configuration, one of `TELLING`, that most of the keys tell of."""
-    return max(TELLING, key=lambda kind: _count_telling(values, kind))
+    """Return the kind of configuration, one of `KINDS`, to which most of the keys belong."""
+    return max(KINDS, key=lambda kind: _count_keys(values, kind))
 
 
-def _count_telling(values: Mapping[str, Any], kind: str) -> int:
-    """How many of the keys only configurations of a kind have."""
-    return len(set(values).intersection(TELLING[kind][1].split()))
+def _count_keys(values: Mapping[str, Any], kind: str) -> int:
+    """Return the number of keys that only configurations of a kind have."""
+    return len(set(values).intersection(KINDS[kind][1].split()))
 
 
-def is_a(kind: str) -> Callable[[Any], Any]:
-    """A check of raw parameters: they are of a kind, or of none in particular.
+def kind_check(kind: str) -> Callable[[Any], Any]:
+    """Return a check of raw parameters, which refuses configurations of another kind.
 
-    Raises:
-        ValueError: More of the keys are of another kind.
+    The check raises ValueError if more of the keys belong to another kind.
     """
 
     def check(values: Any) -> Any:
-        given = values if isinstance(values, dict) else {}
-        likely = kind_of(given)
-        if _count_telling(given, likely) > _count_telling(given, kind):
-            command = f"{TELLING[likely][0]} FILE"
+        keys = values if isinstance(values, dict) else {}
+        likely = kind_of(keys)
+        if _count_keys(keys, likely) > _count_keys(keys, kind):
+            command = f"{KINDS[likely][0]} FILE"
             raise ValueError(f"this is the configuration of a {likely}: {command}")
         return values
 
@@ -72,44 +71,44 @@ class CodeNamingModel(Model):
 
     @property
     def names_of_code(self) -> list[str]:
-        """Those names."""
+        """Names that may stand for code."""
         raise NotImplementedError
 
 
 _Config = TypeVar("_Config", bound=CodeNamingModel)
-_FILES = "elastic_user_file_"
+_MODULE_PREFIX = "elastic_user_file_"
 _ROOT = Path(__file__).parents[2]
-_OURS = tuple(_ROOT / name for name in ("elastic_env", "baselines", "train"))
+_OWN_FOLDERS = tuple(_ROOT / name for name in ("elastic_env", "baselines", "train"))
 _Refuse = Callable[[str], None]
-_REFUSE: ContextVar[_Refuse] = ContextVar("refuse", default=lambda _: None)
-"""Called with each name before its code runs."""
+_CODE_CHECK: ContextVar[_Refuse] = ContextVar("code_check", default=lambda _: None)
+"""Is called with each name before its code runs."""
 _TRUST = "say --trust-code, or name a configuration of yours"
-"""What the user can do who trusts the folder of a run."""
+"""Cure for a user who trusts the folder of a run."""
 
 
 def _refuse(file: Path, cure: str, name: str) -> None:
-    """Refuse a name that stands for code in a file whose names must not run any."""
+    """Refuse a name of code in a file that must not run code."""
     problem = f"{file} names {quote(name)}, whose code would run"
     raise ConfigurationError(f"{problem}; look at it, then {cure}")
 
 
 def load_without_code(file: Path, kind: type[_Config], cure: str) -> _Config:
-    """A configuration that was found and not named by the user; nothing that it names is imported.
+    """Load a configuration that the user did not name, without importing code that it names.
 
     Args:
-        file: Where it was found.
-        kind: Of the configuration.
-        cure: What the user can do who trusts it, in words.
+        file: File of the configuration.
+        kind: Class of the configuration.
+        cure: Advice for a user who trusts the file.
 
     Raises:
-        ConfigurationError: It is no such configuration, or names code.
+        ConfigurationError: The file is no such configuration, or it names code.
     """
     refuse = partial(_refuse, file, cure)
-    before = _REFUSE.set(refuse)
+    token = _CODE_CHECK.set(refuse)
     try:
         config = load_yaml(file, kind)
     finally:
-        _REFUSE.reset(before)
+        _CODE_CHECK.reset(token)
     for name in config.names_of_code:
         if ":" in name:
             refuse(name)
@@ -117,12 +116,12 @@ def load_without_code(file: Path, kind: type[_Config], cure: str) -> _Config:
 
 
 def recorded_config(folder: Path, kind: type[_Config], trust_code: bool = False) -> _Config:
-    """The configuration of a run that is gone on with.
+    """Load the configuration of a run that is to be continued.
 
     Args:
-        folder: Of the run.
-        kind: Of the configuration.
-        trust_code: Whether code that it names may run: it may lie in the folder.
+        folder: Folder of the run.
+        kind: Class of the configuration.
+        trust_code: Run code that the configuration names, which may be in the folder.
 
     Raises:
         ConfigurationError: The folder is no such run, or names code that is not trusted.
@@ -134,76 +133,76 @@ def recorded_config(folder: Path, kind: type[_Config], trust_code: bool = False)
 
 
 def named_object(name: str) -> Any:
-    """The object that a name stands for.
+    """Import the object that a name stands for.
 
     Args:
         name: "module:attribute", or "FILE.py:attribute" with the path of a file, which need not be
             on the module path.
 
     Raises:
-        ConfigurationError: There is no such module, file or attribute, or it fails while it is
-            imported; or code is refused here, and nothing was imported.
+        ConfigurationError: There is no such module, file or attribute; or its import fails; or code
+            is refused here, and nothing was imported.
     """
-    _REFUSE.get()(name)
-    place, _, attribute = name.rpartition(":")
-    look_last_in(Path.cwd())
+    _CODE_CHECK.get()(name)
+    source, _, attribute = name.rpartition(":")
+    append_to_path(Path.cwd())
     try:
-        module = _from_file(Path(place)) if place.endswith(".py") else _from_path(place)
+        module = _import_file(Path(source)) if source.endswith(".py") else _import_module(source)
     except (Exception, SystemExit) as error:
         raise ConfigurationError(
-            f"{shorten(place)} cannot be imported: {type(error).__name__}: {error}"
+            f"{shorten(source)} cannot be imported: {type(error).__name__}: {error}"
         ) from error
     if not hasattr(module, attribute):
         _require_unshadowed(module, attribute)
         functions = inspect.getmembers(module, inspect.isfunction)
-        classes = inspect.getmembers(module, inspect.isclass)
-        known = [*functions, *classes]
-        own = [name for name, found in known if found.__module__ == module.__name__]
-        if not own:
-            problem = f"{shorten(place)} has no {attribute!r}"
+        members = [*functions, *inspect.getmembers(module, inspect.isclass)]
+        names = [name for name, member in members if member.__module__ == module.__name__]
+        if not names:
+            problem = f"{shorten(source)} has no {attribute!r}"
             raise ConfigurationError(f"{problem}, and no function or class of its own")
-        raise unknown_name(f"function or class of {shorten(place)}", attribute, own)
+        raise unknown_name(f"function or class of {shorten(source)}", attribute, names)
     return getattr(module, attribute)
 
 
-def line_of_user(error: BaseException) -> str:
-    """The last line of a user's code that an error came through, as " (FILE:LINE)"; or nothing.
+def user_line(error: BaseException) -> str:
+    """Return the last line of a user's code in a traceback, as " (FILE:LINE)"; "" if there is none.
 
-    The user's code begins where ours calls it. Libraries that it calls lie in other folders.
+    The first frame outside our packages is the user's code. Libraries that it calls are in other
+    folders.
     """
     frames = traceback.extract_tb(error.__traceback__)
     paths = [Path(frame.filename) for frame in frames]
-    theirs = [path.parent for path in paths if not any(map(path.is_relative_to, _OURS))]
+    foreign = [path.parent for path in paths if not any(map(path.is_relative_to, _OWN_FOLDERS))]
     lines = [
         f" ({path.name}:{frame.lineno})"
         for frame, path in zip(frames, paths, strict=True)
-        if path.parent in theirs[:1]
+        if path.parent in foreign[:1]
     ]
     return lines[-1] if lines else ""
 
 
 def _require_unshadowed(module: ModuleType, attribute: str) -> None:
-    """Refuse a module that was meant to be a file of the working folder, which comes last."""
+    """Refuse a module that hides a file of the same name in the working folder."""
     file = Path(f"{module.__name__.replace('.', '/')}.py")
-    found = getattr(module, "__file__", None)
-    if file.is_file() and (found is None or file.resolve() != Path(found).resolve()):
-        problem = f"{found or 'a built-in module'} stands before your {file}"
+    origin = getattr(module, "__file__", None)
+    if file.is_file() and (origin is None or file.resolve() != Path(origin).resolve()):
+        problem = f"{origin or 'a built-in module'} is imported instead of your {file}"
         raise ConfigurationError(f"{problem}; name the file itself: {file}:{attribute}")
 
 
-def _from_path(module: str) -> ModuleType:
+def _import_module(module: str) -> ModuleType:
     if not module or module.startswith("."):
         raise ImportError("the module must have its full name")
     return importlib.import_module(module)
 
 
-def _from_file(path: Path) -> ModuleType:
-    """A file as a module of a name of its own, so that train.py is not taken for our package."""
+def _import_file(path: Path) -> ModuleType:
+    """Import a file under a name with a prefix, so that train.py does not hide our package."""
     resolved = path.resolve()
-    name = _FILES + resolved.stem
-    known = sys.modules.get(name)
-    if known is not None and known.__file__ == str(resolved):
-        return known
+    name = _MODULE_PREFIX + resolved.stem
+    imported = sys.modules.get(name)
+    if imported is not None and imported.__file__ == str(resolved):
+        return imported
     if not resolved.is_file():
         raise FileNotFoundError(f"there is no file {shorten(path)}")
     spec = importlib.util.spec_from_file_location(name, resolved)

@@ -1,1 +1,1 @@
-"""Throughput against raw physics."""
+"""Throughput compared with raw physics, and latency of policies."""

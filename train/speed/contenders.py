@@ -1,43 +1,31 @@
-"""Contenders of `elastic speed`: each plays control steps and measures how long they take."""
+"""Contenders of `elastic speed`: our environments and raw physics, timed over control steps."""
 
 import itertools
 import time
 from abc import ABC, abstractmethod
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
 from typing import Any
 
 import gymnasium
 import mujoco
 import numpy as np
-from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 from typing_extensions import override
 
-from baselines.compensation.inputs import COMMAND, DEFLECTION, inputs_of
-from baselines.residual.correction import Corrected
-from baselines.residual.features import Features
-from baselines.residual.network import Network
-from baselines.residual.residual_policy import ResidualPolicy
-from baselines.residual.settings import ResidualDescription, ResidualSettings
 from elastic_env.core.signals import Array
 from train.evaluate.conditions import Condition, PolicySpec
 from train.evaluate.rollout import make_policy, make_vector_env, policy_errors
+from train.speed.untrained_residual import untrained_residual
 
-PPO_DECISIONS = 512
-"""Decisions that PPO collects before it learns from them."""
-IN_PROCESSES = ("Gymnasium AsyncVectorEnv", "SB3 SubprocVecEnv")
-IN_THIS_PROCESS = ("Gymnasium SyncVectorEnv", "SB3 DummyVecEnv")
-"""Vector environments of others, by whether each world is a process."""
 _STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 
 
 class Contender(ABC):
-    """Something that plays control steps.
+    """A loop over control steps.
 
     Attributes:
         title: Name in tables.
-        num_envs: Worlds.
-        env: Whatever it plays in.
+        num_envs: Number of worlds.
+        env: Environment that plays the steps.
     """
 
     title: str
@@ -46,15 +34,15 @@ class Contender(ABC):
 
     @abstractmethod
     def run(self, steps: int) -> float:
-        """Play about so many control steps in every world; steps per second of all worlds."""
+        """Play about `steps` control steps in each world; return steps per second of all worlds."""
 
     def close(self) -> None:
-        """End what it has started."""
+        """Close the environment."""
         self.env.close()
 
 
 class _OurLoop(Contender):
-    """An environment of ours; keeps the servo inputs of its last run."""
+    """An environment of this package; keeps the servo inputs of its last run."""
 
     def __init__(self, env: Any) -> None:
         self.env = env
@@ -74,18 +62,18 @@ class _OurLoop(Contender):
 
     @abstractmethod
     def step(self) -> None:
-        """One control period in every world."""
+        """Play one control step in every world."""
 
 
 class VectorLoop(_OurLoop):
     """Our vector environment, with zero offsets or a policy in its loop.
 
     Args:
-        env: Environment.
-        num_envs: Worlds.
-        threads: Of the physics on the CPU.
-        policy: In the loop; None for zero offsets.
-        residual: Whether an untrained network corrects the policy.
+        env: Name of the environment.
+        num_envs: Number of worlds.
+        threads: Threads of the physics on the CPU.
+        policy: Policy in the loop; None for zero offsets.
+        residual: Correct the policy by an untrained network.
         **backend: Arguments `backend` and `device` of the environment.
     """
 
@@ -103,10 +91,9 @@ class VectorLoop(_OurLoop):
         with_network = " and residual network" if residual else ""
         self.title = f"vector env{on_warp}{with_policy}{with_network}"
         self.num_envs = num_envs
-        self._condition = _condition(env, policy)
+        self._condition = make_condition(env, policy)
         super().__init__(make_vector_env(self._condition, num_envs, threads, **backend))
-        spec = self._condition.policy
-        self._policy = None if policy is None else make_policy(spec, self.env)
+        self._policy = None if policy is None else make_policy(self._condition.policy, self.env)
         if residual:
             self._policy = untrained_residual(self._policy, self.env)
         self._state: Any = None
@@ -121,10 +108,10 @@ class VectorLoop(_OurLoop):
     @override
     def step(self) -> None:
         if self._policy is not None:
-            seen = (self._observation, self._state, self._start)
-            self._action, self._state = self._policy.predict(*seen, deterministic=True)
+            inputs = (self._observation, self._state, self._start)
+            self._action, self._state = self._policy.predict(*inputs, deterministic=True)
         self._observation, _, terminated, truncated, _ = self.env.step(self._action)
-        # a world that ends begins a step later
+        # a world that ends starts again one step later
         self._start = self._done
         self._done = terminated | truncated
 
@@ -136,7 +123,7 @@ class ScalarLoop(_OurLoop):
     num_envs = 1
 
     def __init__(self, env: str) -> None:
-        super().__init__(_make(env).unwrapped)
+        super().__init__(make_scalar_env(env).unwrapped)
 
     @override
     def step(self) -> None:
@@ -146,11 +133,10 @@ class ScalarLoop(_OurLoop):
 
 
 class RawWorlds(Contender):
-    """`mj_step` and nothing else: threads share the worlds, each with one `MjData` in its cache.
+    """`mj_step` alone: threads share the worlds, each thread with one `MjData` in its cache.
 
-    It starts from the states of an environment and plays the servo inputs of its last run: on a
-    thread nothing but writing `ctrl` and one call of `mj_step` with all sub-steps of a control
-    period.
+    It starts from the states of an environment and plays the servo inputs of its last run. In a
+    control period a thread only writes `ctrl` and calls `mj_step` once, with all sub-steps.
     """
 
     title = "raw mj_step"
@@ -177,7 +163,7 @@ class RawWorlds(Contender):
 
     @override
     def close(self) -> None:
-        """Nothing: the environment is the loop's."""
+        """Do nothing, since the loop closes its environment."""
 
     def _play(self, thread: int, controls: Array) -> None:
         model = self._model
@@ -192,7 +178,7 @@ class RawWorlds(Contender):
             mujoco.mj_getState(model, data, self.states[world], _STATE)
 
     def _state_of(self, simulation: Any, world: int) -> Array:
-        """Integration state of a world of the environment."""
+        """Return the integration state of a world of the environment."""
         data = self._data[0]
         state = np.empty(mujoco.mj_stateSize(self._model, _STATE))
         mujoco.mj_resetData(self._model, data)
@@ -205,129 +191,12 @@ class RawWorlds(Contender):
         return state
 
 
-class ForeignLoop(Contender):
-    """Scalar environments of ours in somebody else's vector environment, under zero offsets.
-
-    Args:
-        env: Environment.
-        kind: Of `IN_PROCESSES` or `IN_THIS_PROCESS`.
-        num_envs: Worlds.
-    """
-
-    def __init__(self, env: str, kind: str, num_envs: int) -> None:
-        from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
-
-        subprocesses = partial(SubprocVecEnv, start_method="spawn")
-        makers = (AsyncVectorEnv, subprocesses, SyncVectorEnv, DummyVecEnv)
-        make: Any = makers[[*IN_PROCESSES, *IN_THIS_PROCESS].index(kind)]
-        self.title = kind
-        self.num_envs = num_envs
-        self.env = make([partial(_make, env)] * num_envs)
-        self.env.reset()
-        one_world = getattr(self.env, "single_action_space", self.env.action_space)
-        self._action = np.zeros((num_envs, *one_world.shape), dtype=np.float32)
-
-    @override
-    def run(self, steps: int) -> float:
-        begin = time.perf_counter()
-        for _ in range(steps):
-            self.env.step(self._action)
-        return self.num_envs * steps / (time.perf_counter() - begin)
+def make_condition(env: str, policy: str | None = None) -> Condition:
+    """Return the condition of an environment with a policy, `zero` by default."""
+    return Condition(env=env, policy=PolicySpec(name=policy or "zero"))
 
 
-class PPOLoop(Contender):
-    """PPO end to end, collecting and learning, of a residual.
-
-    Args:
-        env: Environment.
-        policy: Base.
-        n: Worlds.
-        threads: Of our vector environment; None for a process for each world.
-    """
-
-    def __init__(self, env: str, policy: str, n: int, threads: int | None) -> None:
-        import torch
-        from stable_baselines3 import PPO
-        from stable_baselines3.common.logger import Logger
-        from stable_baselines3.common.vec_env import SubprocVecEnv
-
-        from baselines.residual_env import ResidualVectorWrapper
-        from train.learn.sb3_env import SB3VecEnv
-
-        where = f"SubprocVecEnv({n})" if threads is None else "vector env"
-        self.title = f"PPO with {policy}, {where}"
-        self.num_envs = n
-        if threads is None:
-            maker = partial(_make_corrected, env, policy)
-            venv: Any = SubprocVecEnv([maker] * n, start_method="spawn")
-        else:
-            condition = _condition(env, policy)
-            inner = make_vector_env(condition, n, threads, AutoresetMode.SAME_STEP)
-            base = make_policy(condition.policy, inner)
-            venv = SB3VecEnv(ResidualVectorWrapper(inner, base, acts_on=_acts_on(base)))
-        self._period = ResidualSettings().decision_period
-        torch.set_num_threads(1)
-        self._rollout = max(PPO_DECISIONS // n, 8)
-        self._model = PPO(
-            "MlpPolicy",
-            venv,
-            n_steps=self._rollout,
-            batch_size=512,
-            n_epochs=10,
-            gamma=0.95,
-            device="cpu",
-            policy_kwargs={"net_arch": [64, 64]},
-        )
-        # SB3's own logger makes a folder in /tmp
-        self._model.set_logger(Logger(folder=None, output_formats=[]))
-        self.env = self._model.get_env()
-
-    @override
-    def run(self, steps: int) -> float:
-        """Learn for one iteration of `PPO_DECISIONS`, or of 8 in each world: there is no less."""
-        before = self._model.num_timesteps
-        begin = time.perf_counter()
-        self._model.learn(self._rollout * self.num_envs, reset_num_timesteps=False)
-        decisions = self._model.num_timesteps - before
-        return decisions * self._period / (time.perf_counter() - begin)
-
-
-def untrained_residual(base: Any, env: Any) -> ResidualPolicy:
-    """A residual with an untrained network of 64×64, small random weights, on a base policy."""
-    model = env.unwrapped.assumed_model
-    corrected = Corrected(base, model, ResidualSettings(acts_on=_acts_on(base)))
-    features = Features(corrected).width
-    generator = np.random.default_rng(0)
-    tensors = {"mean": np.zeros(features), "std": np.ones(features)}
-    widths = itertools.pairwise([features, 64, 64, corrected.num_residuals])
-    for i, (inputs, outputs) in enumerate(widths):
-        tensors[f"weight{i}"] = 0.01 * generator.normal(size=(outputs, inputs))
-        tensors[f"bias{i}"] = np.zeros(outputs)
-    robot = env.unwrapped.task.name
-    description = ResidualDescription(robot=robot, base="", settings=corrected.settings)
-    return ResidualPolicy(corrected, Network(description, tensors))
-
-
-def _acts_on(base: Any) -> dict[str, Any]:
-    """The input of a base that a residual acts on, with its default bound."""
-    return {DEFLECTION if DEFLECTION in inputs_of(base) else COMMAND: None}
-
-
-def _condition(env: str, policy: str | None = None) -> Condition:
-    spec = PolicySpec(name=policy or "zero")
-    return Condition(env=env, policy=spec)
-
-
-def _make(env: str, policy: str | None = None) -> Any:
-    """A scalar environment with what a policy needs, also in a process of its own."""
-    condition = _condition(env, policy)
+def make_scalar_env(env: str, policy: str | None = None) -> Any:
+    """Make a scalar environment with the sensors that a policy needs, in any process."""
+    condition = make_condition(env, policy)
     return gymnasium.make(condition.environment.id, **condition.arguments)
-
-
-def _make_corrected(env: str, policy: str) -> Any:
-    """A scalar environment with the residual of a base policy around it."""
-    from baselines.residual_env import ResidualWrapper
-
-    made = _make(env, policy)
-    base = make_policy(_condition(env, policy).policy, made)
-    return ResidualWrapper(made, base, acts_on=_acts_on(base))

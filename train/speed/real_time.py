@@ -1,4 +1,4 @@
-"""A policy against the clock: is its command ready within the control period, as on a robot?"""
+"""Latency of a policy that is called at the control rate, as on a robot."""
 
 import contextlib
 import time
@@ -15,7 +15,7 @@ from train.evaluate.environments import environment
 from train.evaluate.rollout import control_steps, make_policy, policy_errors
 
 PERCENTILES = {"median": 50.0, "p99": 99.0, "p999": 99.9, "max": 100.0}
-"""Latencies that are reported: those that so many per cent of the cycles do not exceed."""
+"""Reported percentiles of the latency [%]."""
 
 
 def play_against_the_clock(
@@ -23,15 +23,14 @@ def play_against_the_clock(
 ) -> dict[str, Any]:
     """Record what a policy observes in an episode, then call it with that at the control rate.
 
-    The loop asks for real-time scheduling, as the one of a motion on hardware does, and tells
-    whether it has it. The episode begins again, with a policy that remembers nothing, where it is
-    shorter than what is to be played.
+    The loop requests real-time scheduling, as a motion on hardware does. If the episode is too
+    short, it starts again, and the policy without memory.
 
     Args:
-        env_name: Environment.
+        env_name: Name of the environment.
         policy_name: Policy that is timed; None for adaptive_posture on the walker, input on the
             testbed.
-        seconds: How long it is played against the clock [s].
+        seconds: Time for which the policy is called [s].
 
     Returns:
         Environment, policy, whether the system granted real-time scheduling, and the figures of
@@ -41,8 +40,8 @@ def play_against_the_clock(
         ConfigurationError: Environment or policy does not exist.
         PolicyFailedError: The policy failed.
     """
-    known = environment(env_name)
-    name = policy_name or known.live_policy or known.looped_policy
+    defaults = environment(env_name)
+    name = policy_name or defaults.live_policy or defaults.looped_policy
     condition = Condition(env=env_name, policy=PolicySpec(name=name))
     env: Any = gymnasium.make(condition.environment.id, **condition.arguments)
     with contextlib.closing(env):
@@ -51,21 +50,20 @@ def play_against_the_clock(
         cycles = max(round(seconds / period_s), 1)
         with policy_errors(condition):
             steps = list(islice(control_steps(env, policy, seed=0), max(cycles - 1, 1)))
-            later = [step.observation for step in steps]
-            observations = [steps[0].seen, *later][:cycles]
+            observations = [steps[0].seen, *(step.observation for step in steps)][:cycles]
             is_real_time = realtime.prefer_realtime(realtime.Priority.LOOP)
             try:
-                latency_s, policy_s = _time(policy, observations, cycles, period_s)
+                latency_s, policy_s = _time_policy(policy, observations, cycles, period_s)
             finally:
                 realtime.give_up_realtime()
     figures = summarise(period_s, latency_s, policy_s)
     return {"env": env_name, "policy": name, "is_real_time": is_real_time, **figures}
 
 
-def _time(
+def _time_policy(
     policy: Any, observations: list[Any], cycles: int, period_s: float
 ) -> tuple[Array, Array]:
-    """Latency and time in the policy, (cycles,) [s]; a cycle that begins late is not left out."""
+    """Return latency and time in the policy, (cycles,) [s]; cycles that begin late count too."""
     latency_s = np.empty(cycles)
     policy_s = np.empty(cycles)
     state: Any = None
@@ -90,14 +88,14 @@ def _time(
 
 
 def summarise(period_s: float, latency_s: Array, policy_s: Array) -> dict[str, float]:
-    """Number and share of late cycles, and percentiles of latency and time in the policy [µs].
+    """Return number and share of late cycles, and percentiles of latency and policy time [µs].
 
-    A cycle is late if its command is not ready when the next one is due.
+    A cycle is late if its command is not ready when the next cycle is due.
 
     Args:
         period_s: Control period [s].
-        latency_s: Time from when a cycle was due until its command was ready, (cycles,) [s]; it has
-            the delay with which the system wakes the program.
+        latency_s: Time from when a cycle was due until its command was ready, (cycles,) [s]. It
+            includes the delay with which the system wakes the program.
         policy_s: Time in the policy, without that delay, (cycles,) [s].
     """
     late = int(np.count_nonzero(latency_s > period_s))

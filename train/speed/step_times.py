@@ -10,25 +10,24 @@ from train.evaluate.conditions import Condition
 from train.evaluate.rollout import control_steps, make_policy, make_vector_env
 
 _STEPS = 50
+"""Control steps per round: two decisions of a residual, which take 25 steps each."""
 _ROUNDS = 15
-"""Control steps per round: whole decisions of residuals, which take 25; rounds, of which the
-median counts.
-"""
+"""Rounds; the result is their median."""
 
 
 def step_times(
     conditions: Sequence[Condition], steps: int = _STEPS, rounds: int = _ROUNDS
 ) -> dict[str, float]:
-    """Median processor time of every policy alone for a control step of one world [µs], by title.
+    """Return the median processor time of every policy for a control step [µs], by title.
 
-    The policies play in turn, round by round, so that what else the computer does concerns all of
-    them alike. The first round compiles and warms up, and does not count. Of a residual the first
-    training seed plays. Processor time does not count what other programs take meanwhile.
+    The policies play one world in turn, round by round, so that other load on the computer concerns
+    all of them. The first round compiles and does not count. A residual plays with its first
+    training seed. Processor time excludes other programs.
 
     Args:
-        conditions: Cells of a comparison; each policy plays the first of its own.
+        conditions: Cells of a comparison; each policy plays its first cell.
         steps: Control steps per round.
-        rounds: Rounds that count.
+        rounds: Counted rounds.
     """
     first: dict[str, Condition] = {}
     for condition in conditions:
@@ -44,33 +43,32 @@ def step_times(
     finally:
         for player in players.values():
             player.close()
-    return {title: statistics.median(own) for title, own in times.items()}
+    return {title: statistics.median(values) for title, values in times.items()}
 
 
 class _Player:
-    """A policy in an environment of one world; it measures itself."""
+    """A policy in an environment of one world; it measures its own processor time."""
 
     def __init__(self, condition: Condition) -> None:
         self._env = make_vector_env(condition, 1, num_threads=1)
-        options = condition.policy_options
-        self._policy = make_policy(condition.policy, self._env, options)
+        self._policy = make_policy(condition.policy, self._env, condition.policy_options)
         self._spent_s = 0.0
         self._steps = control_steps(self._env, self, condition.seed)
 
     def predict(self, *arguments: Any, **options: Any) -> tuple[Any, Any]:
-        """The command of the policy; its processor time is added up."""
+        """Return the command of the policy, and add its processor time to the sum."""
         begin = time.process_time()
-        found = self._policy.predict(*arguments, **options)
+        prediction = self._policy.predict(*arguments, **options)
         self._spent_s += time.process_time() - begin
-        return found
+        return prediction
 
     def play(self, steps: int) -> float:
-        """Play control steps; the time that the policy alone took [s]."""
+        """Play control steps, and return the time of the policy alone [s]."""
         before = self._spent_s
         for _ in islice(self._steps, steps):
             pass
         return self._spent_s - before
 
     def close(self) -> None:
-        """End the environment."""
+        """Close the environment."""
         self._env.close()

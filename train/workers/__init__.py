@@ -1,1 +1,1 @@
-"""Calls beside this program: in processes of this machine, on a dask cluster, as jobs of Slurm."""
+"""Calls in workers: processes of this machine, a dask cluster, or jobs of Slurm."""

@@ -1,109 +1,46 @@
-"""Calls beside each other, wherever their futures come from: faults, reports and Ctrl-C.
+"""Calls that run at the same time in a pool of workers: faults, reports and Ctrl-C.
 
-A call that raises is an outcome, and the others go on. A call whose worker is lost begins anew
-elsewhere.
+A call that raises is an outcome, and the other calls continue. A call whose worker is lost starts
+again in another worker.
 """
 
-import os
-import pickle
-import platform
 import queue
 import signal
 import threading
-import traceback
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from elastic_env.core.errors import ConfigurationError, ElasticError, SystemFailedError
-from train.runs.import_path import leave
-from train.workers.versions import VersionsDifferError, everything, require_same
+from train.workers.pool import (
+    MAX_RETRIES,
+    CallFailedError,
+    ExecutorLostError,
+    Outcome,
+    Pool,
+    UnguardedScriptError,
+    WorkerKilledError,
+    WorkerLostError,
+)
+from train.workers.remote_call import run_remote_call
+from train.workers.versions import VersionsDifferError, everything
 
-MOST_MOVES = 2
-"""How often a call begins anew after its worker was lost."""
-_WAIT_S = 0.2
-
-Reporter = Callable[[int, Any], None]
-"""Takes the number of a call and what it reports; it travels to the workers."""
-
-
-class WorkerLostError(SystemFailedError):
-    """The worker of a call is gone: killed, preempted, or out of reach.
-
-    A future raises it.
-    """
-
-
-class WorkerKilledError(SystemFailedError):
-    """A call lost its worker each time that it was begun."""
-
-    def __init__(self) -> None:
-        super().__init__(
-            "a worker process was killed each time that it was tried, most often for lack of"
-            " memory; take fewer --jobs or more memory"
-        )
-
-
-class ExecutorLostError(SystemFailedError):
-    """The executor is gone: the scheduler of a cluster."""
-
-
-class UnguardedScriptError(ConfigurationError):
-    """Workers import the script that runs here, and it would start workers again.
-
-    A future raises it.
-    """
-
-    def __init__(self) -> None:
-        super().__init__(
-            "a process ended while it started; a script that starts processes must do so below "
-            'if __name__ == "__main__": since each of them imports the script'
-        )
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """Result of a call.
-
-    Attributes:
-        value: What it returned.
-        error: What it raised; None where it returned.
-        trace: Traceback of the error.
-    """
-
-    value: Any = None
-    error: Exception | None = None
-    trace: str = ""
-
-
-@dataclass(frozen=True)
-class Pool:
-    """Workers.
-
-    Attributes:
-        submit: Runs a function with its arguments. The future that it returns raises
-            `WorkerLostError` where the call may begin anew.
-        reporter: How a call reports.
-        events: Where the reports arrive, as pairs of number and report.
-    """
-
-    submit: Callable[..., Future[Any]]
-    reporter: Reporter
-    events: "queue.SimpleQueue[Any]" = field(default_factory=queue.SimpleQueue)
+_POLL_S = 0.2
+_FATAL = (VersionsDifferError, ExecutorLostError, UnguardedScriptError)
+"""Errors that end all calls."""
 
 
 @dataclass
 class Tally:
-    """How many calls are where.
+    """Numbers of calls by state.
 
     Attributes:
-        total: All of them.
-        done: Those that returned.
-        failed: Those that raised.
-        running: Numbers of those that have begun.
+        total: Number of all calls.
+        done: Number of calls that returned.
+        failed: Number of calls that raised.
+        running: Numbers that identify the running calls.
     """
 
     total: int = 0
@@ -117,26 +54,26 @@ class Tally:
         self.done += outcome.error is None
         self.failed += outcome.error is not None
 
-    def in_words(self, unit: str) -> str:
-        """Such as: 3 of 8 cells done, 2 running, 0 failed."""
+    def summary(self, unit: str) -> str:
+        """Return a text such as: 3 of 8 cells done, 2 running, 0 failed."""
         running = len(self.running)
         return f"{self.done} of {self.total} {unit} done, {running} running, {self.failed} failed"
 
 
 @dataclass(frozen=True)
 class Watch:
-    """Who is told how calls go.
+    """Functions that are called while calls run.
 
     Attributes:
-        reported: Takes the number of a call and what it reports.
-        ended: Takes the number of a call and its outcome, as soon as it has one.
-        moved: Takes the number of a call that begins anew.
-        tally: How many calls are where, before and after each of these.
+        on_report: Takes the number of a call and its report.
+        on_end: Takes the number of a call and its outcome, as soon as it has one.
+        on_move: Takes the number of a call that starts again in another worker.
+        tally: Numbers of calls by state, up to date when these functions are called.
     """
 
-    reported: Callable[[int, Any], None] = lambda *_: None
-    ended: Callable[[int, Outcome], None] = lambda *_: None
-    moved: Callable[[int], None] = lambda _: None
+    on_report: Callable[[int, Any], None] = lambda *_: None
+    on_end: Callable[[int, Outcome], None] = lambda *_: None
+    on_move: Callable[[int], None] = lambda _: None
     tally: Tally = field(default_factory=Tally)
 
 
@@ -150,22 +87,22 @@ def run_calls(
     """Call a function with each of some arguments.
 
     Args:
-        function: At the top of a module; it gets the arguments and, behind them, a function that
-            takes its reports.
-        arguments: Of each call.
-        pool: Where they run.
-        watch: Who is told how they go.
-        finishes: Whether the first Ctrl-C lets running calls end and starts no others; else it ends
-            at once.
+        function: Function at the top of a module. It gets the arguments and, after them, a function
+            that takes its reports.
+        arguments: Arguments of each call.
+        pool: Workers that run the calls.
+        watch: Functions that follow the calls.
+        finishes: True if the first Ctrl-C lets running calls end and starts no others; else it ends
+            all at once.
 
     Returns:
-        Outcomes in the order of the arguments; None for calls that Ctrl-C kept from starting.
+        Outcomes in the order of the arguments; None for calls that did not start because of Ctrl-C.
 
     Raises:
         VersionsDifferError: A machine has other versions.
         ExecutorLostError: The executor is gone.
-        UnguardedScriptError: Workers cannot import the script that runs here.
-        KeyboardInterrupt: Ctrl-C for the second time, or the first where `finishes` is false.
+        UnguardedScriptError: Workers cannot import the running script.
+        KeyboardInterrupt: Ctrl-C for the second time, or the first if `finishes` is false.
     """
     outcomes: list[Outcome | None] = [None] * len(arguments)
     tries = [0] * len(arguments)
@@ -174,10 +111,10 @@ def run_calls(
 
     def submit(number: int) -> None:
         tries[number] += 1
-        place = (Path.cwd(), everything(), pool.reporter)
+        settings = (Path.cwd(), everything(), pool.reporter)
         try:
-            future = pool.submit(carry_out, function, arguments[number], number, *place)
-        except RuntimeError as error:  # it was shut down
+            future = pool.submit(run_remote_call, function, arguments[number], number, *settings)
+        except RuntimeError as error:  # the pool was shut down
             raise ExecutorLostError(f"the workers are gone: {error}") from None
         futures[future] = number
         future.add_done_callback(pool.events.put)
@@ -192,30 +129,30 @@ def run_calls(
             raise outcome.error
         if isinstance(outcome.error, WorkerLostError):
             watch.tally.running.discard(number)
-            if asked.is_set():
+            if interrupt.is_set():
                 return
-            if tries[number] <= MOST_MOVES:
-                watch.moved(number)
+            if tries[number] <= MAX_RETRIES:
+                watch.on_move(number)
                 submit(number)
                 return
             outcome = Outcome(error=WorkerKilledError())
         outcomes[number] = outcome
         watch.tally.end(number, outcome)
-        watch.ended(number, outcome)
+        watch.on_end(number, outcome)
 
     def report(number: int, value: Any) -> None:
-        if outcomes[number] is None:  # a report may come behind the end
+        if outcomes[number] is None:  # a report may arrive after the end
             watch.tally.running.add(number)
-        watch.reported(number, value)
+        watch.on_report(number, value)
 
-    with _first_ctrl_c() if finishes else nullcontext(threading.Event()) as asked:
+    with _first_interrupt() if finishes else nullcontext(threading.Event()) as interrupt:
         for number in range(len(arguments)):
             submit(number)
         while futures:
-            if asked.is_set():
+            if interrupt.is_set():
                 cancel_waiting()
             with suppress(queue.Empty):
-                event = pool.events.get(timeout=_WAIT_S)
+                event = pool.events.get(timeout=_POLL_S)
                 if not isinstance(event, Future):
                     report(*event)
                 elif event in futures:
@@ -223,82 +160,36 @@ def run_calls(
     return outcomes
 
 
-_FATAL = (VersionsDifferError, ExecutorLostError, UnguardedScriptError)
-"""Errors that end all calls."""
-
-
-def carry_out(
-    function: Callable[..., Any],
-    given: tuple[Any, ...],
-    number: int,
-    folder: Path,
-    versions: Mapping[str, str],
-    reporter: Reporter,
-) -> Outcome:
-    """In a worker: the outcome of a call, which never raises.
-
-    It works in the folder of the program, from which configurations name files, if this machine has
-    it. A machine with other versions than the program's is refused.
-    """
-
-    def report(value: Any) -> None:
-        reporter(number, value)
-
-    try:
-        require_same(versions, everything(), platform.node())
-        if folder.is_dir():
-            os.chdir(folder)
-            leave(folder)
-        report(0)
-        return Outcome(function(*given, report))
-    except Exception as error:
-        return Outcome(error=_portable(error), trace=traceback.format_exc())
-
-
-class CallFailedError(ElasticError):
-    """A call raised an error that does not travel between processes; this one has its text."""
-
-
-def _portable(error: Exception) -> Exception:
-    """An error without its traceback, as it can be sent."""
-    error.__traceback__ = None
-    try:
-        pickle.loads(pickle.dumps(error))
-    except Exception:
-        return CallFailedError(f"{type(error).__name__}: {error}")
-    return error
-
-
 def _outcome(future: Future[Any]) -> Outcome:
+    """Return the outcome of a call whose future is done."""
     if future.cancelled():
-        lost = "the workers are gone: they dropped what was to be done"
-        return Outcome(error=ExecutorLostError(lost))
+        problem = "the workers are gone: they cancelled the waiting calls"
+        return Outcome(error=ExecutorLostError(problem))
     error = future.exception()
     if error is None:
         return future.result()
     if type(error).__name__ == "KilledWorker":  # of dask, which moves calls itself
         return Outcome(error=WorkerKilledError())
-    is_plain = isinstance(error, Exception)
-    return Outcome(error=error if is_plain else CallFailedError(repr(error)))
+    return Outcome(error=error if isinstance(error, Exception) else CallFailedError(repr(error)))
 
 
 @contextmanager
-def _first_ctrl_c() -> Iterator[threading.Event]:
-    """Ctrl-C sets an event; the second one does what it did before."""
-    asked = threading.Event()
+def _first_interrupt() -> Iterator[threading.Event]:
+    """Let the first Ctrl-C set an event; the second one goes to the handler from before."""
+    interrupt = threading.Event()
     before = signal.getsignal(signal.SIGINT)
     is_main = threading.current_thread() is threading.main_thread()
     if not is_main or not callable(before):
-        yield asked
+        yield interrupt
         return
 
-    def note(number: int, frame: Any) -> None:
-        if asked.is_set():
+    def handle(number: int, frame: Any) -> None:
+        if interrupt.is_set():
             before(number, frame)
-        asked.set()
+        interrupt.set()
 
-    signal.signal(signal.SIGINT, note)
+    signal.signal(signal.SIGINT, handle)
     try:
-        yield asked
+        yield interrupt
     finally:
         signal.signal(signal.SIGINT, before)

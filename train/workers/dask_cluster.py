@@ -1,4 +1,4 @@
-"""Workers of a dask cluster, whose scheduler and workers somebody else has started."""
+"""Workers of a dask cluster, whose scheduler and workers the user has started."""
 
 import ipaddress
 import logging
@@ -11,7 +11,7 @@ from functools import partial
 from typing import Any
 
 from elastic_env.core.errors import ConfigurationError, SystemFailedError, missing_extra
-from train.workers.calls import MOST_MOVES, Pool
+from train.workers.pool import MAX_RETRIES, Pool
 from train.workers.versions import everything, require_same
 
 _CONNECT_S = 10
@@ -20,13 +20,13 @@ _WORKER_S = 60
 
 @contextmanager
 def dask_pool(address: str) -> Iterator[Pool]:
-    """Workers of the cluster whose scheduler has an address.
+    """Open a pool of the workers of a dask scheduler.
 
-    Dask itself moves the calls of a worker that is lost: as often as `MOST_MOVES` says, or less
-    where its scheduler is told so.
+    Dask itself moves the calls of a lost worker: `MAX_RETRIES` times, or less often if its
+    scheduler is configured so.
 
     Args:
-        address: Of the scheduler, HOST:PORT.
+        address: Address of the scheduler, HOST:PORT.
 
     Raises:
         SystemFailedError: No scheduler answers there, or it has no worker.
@@ -37,7 +37,7 @@ def dask_pool(address: str) -> Iterator[Pool]:
     except ModuleNotFoundError:
         raise missing_extra("distributed", "cluster", "--on dask://") from None
     warn_of_public(address)
-    # what is lost is said by us
+    # lost workers are reported by this program
     logging.getLogger("distributed").setLevel(logging.CRITICAL)
     options = {"timeout": _CONNECT_S, "set_as_default": False}
     try:
@@ -47,7 +47,7 @@ def dask_pool(address: str) -> Iterator[Pool]:
         cure = "start one there with: dask scheduler --host ADDRESS"
         raise SystemFailedError(f"{problem}; {cure}") from None
     with client:
-        _prepare(client, address)
+        _prepare_cluster(client, address)
         topic = f"elastic-{uuid.uuid4().hex}"
         executor = client.get_executor(pure=False)
         pool = Pool(executor.submit, partial(_log_event, topic))
@@ -57,21 +57,21 @@ def dask_pool(address: str) -> Iterator[Pool]:
         finally:
             with suppress(Exception):  # the scheduler may be gone
                 client.unsubscribe_topic(topic)
-                executor.shutdown(wait=False)  # cancels what runs
+                executor.shutdown(wait=False)  # cancels running calls
 
 
 def warn_of_public(address: str) -> None:
-    """Warn of a scheduler, which runs the code of whoever reaches it, at a public address.
+    """Warn of a scheduler at a public address, since anyone who reaches it can run code there.
 
     Args:
-        address: HOST:PORT; a name stands for all of its addresses.
+        address: HOST:PORT; all addresses of a host name are checked.
     """
     host, _, port = address.rpartition(":")
     try:
-        found = socket.getaddrinfo(host.strip("[]"), port, type=socket.SOCK_STREAM)
+        records = socket.getaddrinfo(host.strip("[]"), port, type=socket.SOCK_STREAM)
     except (OSError, UnicodeError):
-        return  # the connection says what is wrong
-    hosts = [str(place[0]).partition("%")[0] for *_, place in found]
+        return  # connecting raises the error
+    hosts = [str(address[0]).partition("%")[0] for *_, address in records]
     public = [host for host in hosts if ipaddress.ip_address(host).is_global]
     if public:
         warnings.warn(
@@ -83,12 +83,12 @@ def warn_of_public(address: str) -> None:
         )
 
 
-def _prepare(client: Any, address: str) -> None:
-    """Wait for a worker, compare versions, and have calls moved no more often than we say."""
+def _prepare_cluster(client: Any, address: str) -> None:
+    """Wait for a worker, compare versions, and limit how often calls are moved."""
     try:
         client.wait_for_workers(1, timeout=_WORKER_S)
-        found = client.run(everything)
-        client.run_on_scheduler(_limit_moves, most=MOST_MOVES)
+        versions_by_worker = client.run(everything)
+        client.run_on_scheduler(_limit_retries, limit=MAX_RETRIES)
     except TimeoutError:
         problem = f"the dask scheduler at {address} had no worker within {_WORKER_S} s"
         cure = f"start one with: dask worker {address} --nthreads 1"
@@ -97,17 +97,17 @@ def _prepare(client: Any, address: str) -> None:
         problem = f"the dask cluster at {address} has no module {error.name!r}"
         cure = "install elastic-env on its scheduler and its workers"
         raise ConfigurationError(f"{problem}; {cure}") from None
-    for worker, versions in found.items():
+    for worker, versions in versions_by_worker.items():
         require_same(everything(), versions, worker)
 
 
-def _limit_moves(most: int, dask_scheduler: Any = None) -> None:
-    """On the scheduler: a call that has lost its worker more often is given up."""
-    dask_scheduler.allowed_failures = min(dask_scheduler.allowed_failures, most)
+def _limit_retries(limit: int, dask_scheduler: Any = None) -> None:
+    """Let the scheduler give up a call that has lost its worker more often than the limit."""
+    dask_scheduler.allowed_failures = min(dask_scheduler.allowed_failures, limit)
 
 
 def _log_event(topic: str, number: int, value: Any) -> None:
-    """In a worker: report by an event of dask, by its scheduler to the client."""
+    """Report from a worker: an event of dask, which its scheduler sends to the client."""
     from distributed import get_worker
 
     get_worker().log_event(topic, (number, value))

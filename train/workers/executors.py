@@ -1,4 +1,4 @@
-"""Executors of calls, as `--on` names them: this machine, a dask cluster, jobs of Slurm."""
+"""Executors of calls, the values of `--on`: this machine, a dask cluster, jobs of Slurm."""
 
 import os
 from contextlib import AbstractContextManager
@@ -7,9 +7,9 @@ from pathlib import Path
 from pydantic import Field
 
 from elastic_env.core.config import Model, load_yaml, quantity
-from train.workers.calls import Pool
 from train.workers.dask_cluster import dask_pool
 from train.workers.local import local_pool
+from train.workers.pool import Pool
 from train.workers.slurm import SlurmConfig, slurm_pool
 
 _LOCAL = "local"
@@ -18,37 +18,37 @@ _NAMES = rf"(?s)^({_LOCAL}|{_DASK}.+:\d+|slurm(:.*)?)$"
 
 
 class Executors(Model):
-    """Where cells of a comparison, or training seeds, run beside each other."""
+    """Machines that run cells of a comparison, or training seeds, at the same time."""
 
     jobs: int = quantity("1", 0, ge=0, le=1024)
     """Cells, or training seeds, at a time on this machine, 0 for one per core; several share the
     cores, and all of them end sooner than one by one. On hardware cells come one after the other; a
-    cluster says itself how many."""
+    cluster decides itself."""
     on: str = Field(default=_LOCAL, pattern=_NAMES)
     """Executors: local, dask://HOST:PORT of a scheduler, slurm, or slurm:FILE.yaml with what a job
     asks for; see docs/cluster.md."""
 
     @property
     def is_local(self) -> bool:
-        """True if they are processes of this machine."""
+        """True if the executors are processes of this machine."""
         return self.on == _LOCAL
 
     def threads_per_call(self, calls: int) -> int:
-        """Threads for each of some calls: an equal share of this machine's cores; elsewhere one."""
+        """Return the threads of a call: an equal share of this machine's cores; elsewhere one."""
         if not self.is_local:
             return 1
         return max(1, (os.cpu_count() or 1) // self._processes(calls))
 
     def _processes(self, calls: int) -> int:
-        """Processes of this machine for some calls: no more than those."""
+        """Return the number of processes of this machine, at most one per call."""
         return min(self.jobs or os.cpu_count() or 1, calls)
 
     def open_pool(self, calls: int, folder: Path) -> AbstractContextManager[Pool]:
-        """Workers for the calls within.
+        """Open a pool of workers.
 
         Args:
-            calls: How many calls there will be.
-            folder: A folder of the run, in which jobs of Slurm have their files.
+            calls: Number of calls that will be made.
+            folder: Folder of the run, for the files of Slurm's jobs.
         """
         if self.is_local:
             return local_pool(self._processes(calls))

@@ -1,4 +1,4 @@
-"""Workers on this machine: a process each, which follows the program that started it."""
+"""Workers on this machine: processes, which end with the program that started them."""
 
 import multiprocessing
 import os
@@ -15,42 +15,41 @@ from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from typing import Any
 
-from train.runs.import_path import safe_children
-from train.workers import calls
+from train.runs.import_path import isolate_children
+from train.workers.pool import CallFailedError, Outcome, Pool, UnguardedScriptError, WorkerLostError
 
 _SPAWN = multiprocessing.get_context("spawn")
 
 
 @contextmanager
-def local_pool(jobs: int) -> Iterator[calls.Pool]:
-    """Processes of this machine, which end with the work within.
+def local_pool(jobs: int) -> Iterator[Pool]:
+    """Open a pool of processes of this machine, which end with the context.
 
     Args:
-        jobs: How many there are at most.
+        jobs: Largest number of processes.
     """
     if getattr(multiprocessing.current_process(), "_inheriting", False):
-        # this is a worker that imports the script of its parent, which says why it ended
+        # this worker imports its parent's script; the parent raises UnguardedScriptError
         sys.exit(1)
-    with safe_children():
-        # its start lets SIGINT through; the threads that start workers block it
+    with isolate_children():
+        # here, since its start would unblock SIGINT in the threads that start workers
         resource_tracker.ensure_running()
     processes = _Processes(jobs)
     try:
-        yield calls.Pool(processes.submit, _report, processes.events)
+        yield Pool(processes.submit, _report, processes.events)
     finally:
         processes.end()
 
 
 class _Processes:
-    """Processes, each with a pipe, and a thread for every call that runs in one.
+    """Processes, each with a pipe, and a thread for every running call.
 
-    A process that dies fails its own call alone; in a `ProcessPoolExecutor` it would fail all of
-    them.
+    A process that dies fails its own call only. In a `ProcessPoolExecutor` it would fail all calls.
     """
 
     def __init__(self, jobs: int) -> None:
         self.events: queue.SimpleQueue[Any] = queue.SimpleQueue()
-        self._threads = ThreadPoolExecutor(jobs, initializer=_block_ctrl_c)
+        self._threads = ThreadPoolExecutor(jobs, initializer=_block_interrupts)
         self._lock = threading.Lock()
         self._workers = set[_Worker]()
         self._idle = list[_Worker]()
@@ -59,13 +58,13 @@ class _Processes:
     def submit(self, *call: Any) -> Future[Any]:
         """Run a function with its arguments in a process.
 
-        The future raises `WorkerLostError` where the process died, and `UnguardedScriptError` where
-        it ended itself before it could begin.
+        The future raises `WorkerLostError` if the process died, and `UnguardedScriptError` if the
+        process ended by itself before the call began.
         """
         return self._threads.submit(self._run, call)
 
     def end(self) -> None:
-        """Stop: a call that waits is dropped, one that runs is ended."""
+        """Cancel waiting calls and terminate running ones."""
         self._threads.shutdown(wait=False, cancel_futures=True)
         with self._lock:
             self._is_closed = True
@@ -78,18 +77,18 @@ class _Processes:
         for worker in workers:
             worker.process.join()
 
-    def _run(self, call: tuple[Any, ...]) -> calls.Outcome:
-        """In a thread: the outcome of a call in a process that is idle, or a new one."""
-        with self._lock:  # no process begins behind `end`
+    def _run(self, call: tuple[Any, ...]) -> Outcome:
+        """Run a call in an idle process or a new one; a thread executes this method."""
+        with self._lock:  # no process starts after `end`
             if self._is_closed:
-                raise calls.WorkerLostError("the workers have been ended")
+                raise WorkerLostError("the workers have been ended")
             worker = self._idle.pop() if self._idle else _Worker()
             self._workers.add(worker)
         try:
             outcome = worker.run(call, self.events)
         except (EOFError, OSError):
             self._discard(worker)
-            raise worker.why() from None
+            raise worker.loss() from None
         except BaseException:  # a call or an outcome that cannot be pickled
             self._discard(worker)
             worker.process.terminate()
@@ -104,90 +103,90 @@ class _Processes:
 
 
 class _Worker:
-    """A process.
+    """A worker process.
 
     Attributes:
         process: The process.
-        pipe: For calls, their reports and their outcomes; closed, it ends an idle process.
+        pipe: Pipe for calls, reports and outcomes; closing it ends an idle process.
     """
 
     def __init__(self) -> None:
         self.pipe, end = _SPAWN.Pipe()
         self.process = _SPAWN.Process(target=_serve, args=(end,))
-        with safe_children():
+        with isolate_children():
             self.process.start()
-        end.close()  # with that of the process the pipe ends too
+        end.close()  # so that the pipe ends when the process does
         self._has_begun = False
 
-    def run(self, call: tuple[Any, ...], events: "queue.SimpleQueue[Any]") -> calls.Outcome:
-        """The outcome of a call, whose reports are handed on.
+    def run(self, call: tuple[Any, ...], events: "queue.SimpleQueue[Any]") -> Outcome:
+        """Run a call, put its reports into a queue, and return its outcome.
 
         Raises:
             EOFError: The process has ended.
-            OSError: Likewise.
+            OSError: The process has ended.
             UnpicklingError: A report or the outcome cannot be read here.
         """
         self.pipe.send(call)
-        while not isinstance(message := _read(self.pipe.recv_bytes()), calls.Outcome):
+        while not isinstance(message := _unpickle(self.pipe.recv_bytes()), Outcome):
             self._has_begun = True
             events.put(message)
         return message
 
-    def why(self) -> Exception:
-        """Why a call in it was lost."""
-        # another thread may be about to learn it
+    def loss(self) -> Exception:
+        """Return the error of a call that was lost with the process."""
+        # the exit code may come later than the end of the pipe
         while (code := self.process.exitcode) is None:
             time.sleep(0.01)
         if self._has_begun or code < 0:
-            return calls.WorkerLostError("a worker process was killed")
-        return calls.UnguardedScriptError()
+            return WorkerLostError("a worker process was killed")
+        return UnguardedScriptError()
 
 
-def _read(content: bytes) -> Any:
-    """What a process sent; an error of its reading is none of the pipe."""
+def _unpickle(content: bytes) -> Any:
+    """Read a message of a process; its errors differ from those of a broken pipe."""
     try:
         return pickle.loads(content)
     except Exception as error:
         raise pickle.UnpicklingError(f"what a worker sent cannot be read: {error}") from error
 
 
-def _block_ctrl_c() -> None:
-    """In a thread that starts processes: they begin with SIGINT blocked, as the thread has it.
+def _block_interrupts() -> None:
+    """Block SIGINT in a thread, and so in the processes that it starts.
 
-    Else it could end one, with a traceback, in the second in which it imports and cannot yet ignore
-    it.
+    A process needs a second for its imports before it can ignore SIGINT. An interrupt in that time
+    would end it with a traceback.
     """
     signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
 
 
-_own_end: "Connection[Any, Any]"
-"""In a worker: its end of the pipe."""
+_parent_pipe: "Connection[Any, Any]"
+"""The worker's end of its pipe to the parent; set in workers only."""
 
 
 def _report(number: int, value: Any) -> None:
-    """In a worker: report on a call."""
-    _own_end.send((number, value))
+    """Report on a call, from a worker."""
+    _parent_pipe.send((number, value))
 
 
-def _serve(end: "Connection[Any, Any]") -> None:
-    """In a worker: carry out calls; the parent decides what happens.
+def _serve(pipe: "Connection[Any, Any]") -> None:
+    """Run calls in a worker until the parent closes the pipe.
 
-    Ctrl-C reaches the whole process group and is left to the parent; a parent that is killed takes
-    its workers with it, so that none of them goes on writing beside a run that was resumed.
+    Ctrl-C reaches the whole process group, and the parent alone handles it. A worker ends with a
+    killed parent, so that it does not write into a run that is resumed meanwhile.
     """
-    global _own_end
-    _own_end = end
+    global _parent_pipe
+    _parent_pipe = pipe
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     with suppress(OSError):  # the parent has ended
         while True:
             try:
-                function, *arguments = end.recv()
-                end.send(function(*arguments))
+                function, *arguments = pipe.recv()
+                pipe.send(function(*arguments))
             except EOFError:
                 return
-            except BaseException as error:  # code of the user ends the process
-                end.send(calls.Outcome(error=calls.CallFailedError(repr(error))))
+            except BaseException as error:  # the user's code ends the process
+                pipe.send(Outcome(error=CallFailedError(repr(error))))
 
 
 def _end_with_parent() -> None:

@@ -1,4 +1,4 @@
-"""Workers as jobs of Slurm, by submitit; they need a folder that all machines see."""
+"""Workers as jobs of Slurm, through submitit; they need a folder that all machines can read."""
 
 import os
 import queue
@@ -16,16 +16,16 @@ from pydantic import Field
 
 from elastic_env.core.config import Model, Title, quantity
 from elastic_env.core.errors import SystemFailedError, missing_extra
-from train.workers.calls import ExecutorLostError, Pool, WorkerLostError
+from train.workers.pool import ExecutorLostError, Pool, WorkerLostError
 
 _POLL_S = 0.5
 
 
 class SlurmConfig(Model):
-    """Limits that a job asks Slurm for; a call is a job of an array."""
+    """Limits that a job requests from Slurm; each call is a job of an array."""
 
     cluster: Literal["slurm", "local"] = "slurm"
-    """slurm, or local: processes of this machine in the place of jobs, to try it without Slurm."""
+    """slurm, or local: processes of this machine instead of jobs, to try it without Slurm."""
     partition: Title | None = Field(default=None, serialization_alias="slurm_partition")
     """Partition; None for Slurm's default."""
     account: Title | None = Field(default=None, serialization_alias="slurm_account")
@@ -43,21 +43,21 @@ class SlurmConfig(Model):
 
     @property
     def parameters(self) -> dict[str, Any]:
-        """As submitit calls them."""
-        given = self.model_dump(by_alias=True, exclude={"cluster"}, exclude_none=True)
-        return {"name": "elastic", **given}
+        """Parameters under the names of submitit."""
+        limits = self.model_dump(by_alias=True, exclude={"cluster"}, exclude_none=True)
+        return {"name": "elastic", **limits}
 
 
 @contextmanager
 def slurm_pool(config: SlurmConfig, folder: Path) -> Iterator[Pool]:
-    """Jobs of Slurm.
+    """Open a pool of Slurm's jobs.
 
     Args:
-        config: What they ask for.
-        folder: For their files, which all machines must see; it goes at the end.
+        config: Limits of the jobs.
+        folder: Folder for their files, which all machines can read; it is removed at the end.
 
     Raises:
-        SystemFailedError: There is no Slurm here.
+        SystemFailedError: This machine has no Slurm.
     """
     try:
         import submitit
@@ -80,14 +80,14 @@ def slurm_pool(config: SlurmConfig, folder: Path) -> Iterator[Pool]:
 
 
 def _report(folder: Path, number: int, value: Any) -> None:
-    """In a worker: report by a file of the call, whole or not at all."""
-    fresh = folder / f"{number}.{os.getpid()}"
-    fresh.write_text(str(int(value)))
-    fresh.rename(folder / str(number))
+    """Report from a worker: write a file for the call, which replaces the old one at once."""
+    new = folder / f"{number}.{os.getpid()}"
+    new.write_text(str(int(value)))
+    new.rename(folder / str(number))
 
 
 class _Jobs:
-    """Hands calls to submitit, and looks after them in a thread."""
+    """Jobs for calls; a thread submits and follows them."""
 
     def __init__(self, executor: Any, reports: Path) -> None:
         self.events: queue.SimpleQueue[Any] = queue.SimpleQueue()
@@ -97,34 +97,33 @@ class _Jobs:
         self._waiting = deque[tuple[Future[Any], tuple[Any, ...]]]()
         self._jobs = dict[Future[Any], Any]()
         self._closed = threading.Event()
-        self._thread = threading.Thread(target=self._look_after, daemon=True)
+        self._thread = threading.Thread(target=self._follow_jobs, daemon=True)
         self._thread.start()
 
     def submit(self, *call: Any) -> Future[Any]:
-        """Keep a function with its arguments for the next array of jobs."""
+        """Queue a function with its arguments for the next array of jobs."""
         future = Future[Any]()
         self._waiting.append((future, call))
         return future
 
     def end(self) -> None:
-        """Submit nothing any more, and cancel jobs that are not done."""
+        """Stop submitting, and cancel jobs that are not done."""
         self._closed.set()
         self._thread.join()
         for job in self._jobs.values():
             with suppress(Exception):  # it may have ended
                 job.cancel()
 
-    def _look_after(self) -> None:
-        """In a thread: submit what waits as an array, and settle what is done."""
+    def _follow_jobs(self) -> None:
+        """Submit waiting calls as an array, and set the results of finished ones, in a thread."""
         while not self._closed.wait(_POLL_S):
             try:
                 self._submit_waiting()
                 self._read_reports()
-                self._settle_done()
+                self._set_results()
             except Exception as error:
-                # Slurm refuses, or the folder is full: that is the end of all calls
-                problem = f"jobs cannot be submitted or followed: {error}"
-                lost = ExecutorLostError(problem)
+                # Slurm refuses, or the folder is full: all calls end
+                lost = ExecutorLostError(f"jobs cannot be submitted or followed: {error}")
                 for future in [*self._jobs, *(future for future, _ in self._waiting)]:
                     if not future.cancelled():
                         future.set_exception(lost)
@@ -148,21 +147,20 @@ class _Jobs:
                 self._reported[file.name] = value
                 self.events.put((int(file.name), value))
 
-    def _settle_done(self) -> None:
+    def _set_results(self) -> None:
         for future, job in list(self._jobs.items()):
             if future.cancelled():
                 job.cancel()
                 del self._jobs[future]
             elif job.done():
                 del self._jobs[future]
-                _settle(future, job)
+                _set_result(future, job)
 
 
-def _settle(future: "Future[Any]", job: Any) -> None:
+def _set_result(future: "Future[Any]", job: Any) -> None:
     if not future.set_running_or_notify_cancel():
         return
     try:
         future.set_result(job.result())
-    except Exception as error:  # killed, out of time or memory: the call never raises
-        problem = f"job {job.job_id} ended without a result: {error}"
-        future.set_exception(WorkerLostError(problem))
+    except Exception as error:  # the job was killed, or out of time or memory
+        future.set_exception(WorkerLostError(f"job {job.job_id} ended without a result: {error}"))
