@@ -26,18 +26,12 @@ from elastic_env.core.errors import ConfigurationError, MissingExtraError
 from tests.cells import METRIC, cell, describe, episode_rows, family, records
 from train.commands.cli import main
 from train.commands.compare import CompareConfig, _each_once
-from train.evaluate.changes import (
-    CEILING,
-    SAME_ROBOT,
-    Change,
-    changes,
-    merge_seeds,
-    percent_interval,
-)
+from train.evaluate.changes import Change, changes
 from train.evaluate.conditions import Condition, Member, PolicySpec
-from train.evaluate.episodes import Evaluation, evaluate
+from train.evaluate.episodes import Evaluation, evaluate, merge_seeds
 from train.evaluate.progress import learning_curves
 from train.evaluate.residual_seeds import expand
+from train.evaluate.scores import pair, score
 from train.evaluate.statistics import (
     Estimate,
     beats,
@@ -46,7 +40,8 @@ from train.evaluate.statistics import (
     interquartile_mean,
     over_seeds,
 )
-from train.evaluate.table import EpisodeTable, pair, score
+from train.evaluate.table import EpisodeTable
+from train.evaluate.terms import CEILING, SAME_ROBOT, percent_interval
 from train.figures.comparison_figures import has_swept_references
 from train.report.change_tables import cells_table, changes_table, print_changes, write_statistics
 from train.report.page import Page

@@ -11,6 +11,7 @@ from elastic_env.core.signals import Array
 from tests.cells import METRIC, cell, family
 from train.evaluate import statistics
 from train.evaluate.changes import changes
+from train.evaluate.scores import over_cells, per_robot, score
 from train.evaluate.statistics import (
     CONFIDENCE,
     RESAMPLES,
@@ -23,10 +24,9 @@ from train.evaluate.statistics import (
     mean_of_robots,
     middle,
     middle_half,
-    over_seeds,
     worst_share,
 )
-from train.evaluate.table import EpisodeTable, over_cells, per_robot, score
+from train.evaluate.table import EpisodeTable
 from train.report.score_tables import scores_table
 
 BOOTSTRAP: dict[str, Any] = {
@@ -42,6 +42,11 @@ COVERAGES = 200
 def _folders_of_residuals_elsewhere(tmp_path: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """Families are folders in the working directory."""
     monkeypatch.chdir(tmp_path)
+
+
+def over_seeds(values: Array) -> Estimate:
+    """Interquartile mean over training seeds."""
+    return estimate(lambda _: values[None], ())
 
 
 @pytest.mark.parametrize("number", [2, 5, 10])

@@ -28,8 +28,8 @@ from baselines.residual.residual_policy import DESCRIPTION, WEIGHTS, find_folder
 from elastic_env.core.errors import ElasticError, quote
 from elastic_env.core.files import digest_of, is_file, read_bounded, write_whole
 from train.evaluate.conditions import Condition
-from train.evaluate.environments import files_of_robot
 from train.evaluate.episodes import Evaluation, episode_labels
+from train.evaluate.robot_file import files_of_robot
 from train.workers.versions import physics
 
 CELLS = "cells"

@@ -35,8 +35,8 @@ from train.evaluate.conditions import (
     cell_of,
 )
 from train.evaluate.episodes import Evaluation, group_by
+from train.evaluate.scores import over_cells
 from train.evaluate.statistics import Estimate
-from train.evaluate.table import over_cells
 from train.report.table_formats import Head, Row, Table, print_table, to_markdown
 from train.runs.annotations import annotation, in_workflow
 from train.runs.folders import run_folder

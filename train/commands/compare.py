@@ -20,7 +20,7 @@ from elastic_env.world.scenario import make_scenario
 from train.cells.play import CellsFailedError, run_conditions
 from train.cells.store import CELLS, Store
 from train.commands.options import OnHardware, name_options
-from train.evaluate.changes import changes, merge_seeds
+from train.evaluate.changes import changes
 from train.evaluate.conditions import (
     Condition,
     EnvOptions,
@@ -32,7 +32,7 @@ from train.evaluate.conditions import (
     require_drawn,
 )
 from train.evaluate.environments import Environment, Reference, environment
-from train.evaluate.episodes import Evaluation
+from train.evaluate.episodes import Evaluation, merge_seeds
 from train.evaluate.maps import MapConfig, heat_maps
 from train.evaluate.residual_seeds import expand
 from train.evaluate.robots import robot_scores

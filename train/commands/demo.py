@@ -18,9 +18,9 @@ from train.evaluate.conditions import PolicySpec
 from train.evaluate.episodes import Evaluation, group_by
 from train.evaluate.rollout import make_vector_env
 from train.figures import comparison_figures, plots
-from train.figures.chart import time_chart
 from train.figures.colours import policy_colours
 from train.figures.identification_plots import draw_identification
+from train.figures.time_chart import time_chart
 from train.report import summary
 from train.report.page import TEXTS, Page
 from train.report.report_text import capital
@@ -107,7 +107,7 @@ class Demo(Model):
                 comparison_figures.draw_static_errors(static, model, fig6),
                 comparison_figures.draw_picture("time", known.curves, motion, sine),
             ]
-            for walk in comparison_figures.cells_together(walks):
+            for walk in comparison_figures.group_cells(walks):
                 files += comparison_figures.draw_signals(walk, folder, self.figure_format)
             page = _report(_testbed_rows(result, static), files[:2], motion, walks)
             files += [
@@ -153,7 +153,7 @@ def _add_cells(page: Page, evaluations: Cells) -> None:
     """Scores of some cells, and the curves of each."""
     known = evaluations[0].condition.environment
     page.add("table", summary.summary_table(evaluations, known.columns))
-    for own in comparison_figures.cells_together(evaluations):
+    for own in comparison_figures.group_cells(evaluations):
         first = own[0].condition
         policies = group_by(own, lambda e: e.condition.policy.title)
         chart = time_chart(policies, known.curves, policy_colours(list(policies)), _POINTS)

@@ -1,7 +1,7 @@
-"""Options of the learning algorithms: which there are, their bounds and meanings.
+"""Options of the learning algorithms, with their bounds and meanings.
 
-A number beyond its bound would become nan, or fill the memory, in the midst of a training; it is
-refused before one.
+A number beyond its bound would become nan or fill the memory during a training, so it is refused
+before.
 """
 
 from collections.abc import Mapping
@@ -14,7 +14,7 @@ from elastic_env.core.config import Model, quantity
 CONSTANTS = "CMA-ES"
 """Algorithm that searches constants instead of training a network."""
 
-_OURS = {
+_SET_BY_TRAINING = {
     "policy": "the network is an MlpPolicy; policy_kwargs has its parameters",
     "env": "the configuration's env and scenarios name the worlds",
     "device": "training runs on the CPU, so that a resumed run ends with the same weights",
@@ -23,10 +23,9 @@ _OURS = {
     "tensorboard_log": "TensorBoard's files go to the folder of the training seed",
     "_init_setup_model": "the model is built whole",
 }
-"""Arguments of the algorithms that are no options, and what stands in their place."""
+"""Arguments of the algorithms that are no options, and what is used instead."""
 
 _LARGEST_WEIGHT = 1e3
-
 
 _Width = Annotated[int, Field(ge=1, le=4096)]
 _Widths = Annotated[list[_Width], Field(max_length=16)]
@@ -58,10 +57,9 @@ class _Options(Model):
 
     @model_validator(mode="before")
     @classmethod
-    def _none_is_set_by_us(cls, values: Any) -> Any:
-        given = [name for name in _OURS if name in values]
-        if given:
-            cures = [f"leave out {name!r}: {_OURS[name]}" for name in given]
+    def _refuse_set_by_training(cls, values: Any) -> Any:
+        cures = [f"leave out {n!r}: {text}" for n, text in _SET_BY_TRAINING.items() if n in values]
+        if cures:
             raise ValueError("; ".join(cures))
         return values
 
@@ -137,7 +135,7 @@ class _PPO(_OnPolicy):
 
 
 class _A2C(_OnPolicy):
-    """Options of A2C; left out, they are those of stable_baselines3 and not these defaults."""
+    """Options of A2C; the defaults of stable_baselines3 apply instead of these."""
 
     rms_prop_eps: float = quantity("1", 1e-5, ge=1e-12, le=1)
     """Smallest divisor of the optimiser."""
@@ -179,25 +177,25 @@ class _CMAES(Model):
     """First standard deviation of the residual in ±1."""
 
 
-class _OnesOwn(_Options, extra="allow"):
-    """Options of a class of one's own, which itself checks those that are not among these."""
+class _UserOptions(_Options, extra="allow"):
+    """Options of a user's class, which itself checks those that are not among these."""
 
 
 MODELS = {"A2C": _A2C, "PPO": _PPO, "SAC": _SAC, CONSTANTS: _CMAES}
 """Options by the name of the algorithm."""
 
 
-def checked_options(algorithm: str, options: Mapping[str, Any]) -> dict[str, Any]:
-    """Options of an algorithm, within their bounds; those that are left out stay so.
+def validate_options(algorithm: str, options: Mapping[str, Any]) -> dict[str, Any]:
+    """Check the options of an algorithm, and return them without adding defaults.
 
     Raises:
         ModelError: One does not exist, is set by the training itself, or is beyond its bound.
     """
-    return MODELS.get(algorithm, _OnesOwn)(**options).model_dump(exclude_unset=True)
+    return MODELS.get(algorithm, _UserOptions)(**options).model_dump(exclude_unset=True)
 
 
 def complete_options(algorithm: str, options: Mapping[str, Any]) -> dict[str, Any]:
-    """Options of an algorithm with our defaults; A2C and a class of one's own keep theirs."""
+    """Add our defaults to the options of an algorithm; A2C and a user's class keep their own."""
     if algorithm not in ("PPO", "SAC", CONSTANTS):
         return dict(options)
     return MODELS[algorithm](**options).model_dump()
