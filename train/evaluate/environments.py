@@ -192,15 +192,13 @@ class Environment:
 
     def is_deterministic(self, scenario: str, reference: Reference) -> bool:
         """True if all episodes of a condition are the same."""
-        if self.is_real:
-            return False
-        return not (make_scenario(scenario, self.walks).is_random or self.draws(reference))
+        is_random = self.is_real or make_scenario(scenario, self.walks).is_random
+        return not (is_random or self.draws(reference))
 
     def differs_by_noise_alone(self, scenario: str, reference: Reference) -> bool:
         """True if all episodes of a condition have one robot and one motion."""
-        if self.is_real:
-            return False
-        return not (make_scenario(scenario, self.walks).draws_robots or self.draws(reference))
+        draws_robots = self.is_real or make_scenario(scenario, self.walks).draws_robots
+        return not (draws_robots or self.draws(reference))
 
     @property
     def failures(self) -> str:

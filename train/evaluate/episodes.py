@@ -181,8 +181,5 @@ def merge_seeds(evaluations: Sequence[Evaluation]) -> list[Evaluation]:
     for number, e in enumerate(evaluations):
         c = e.condition
         key = (number,) if c.member is None else (c.policy.title, *c.cell)
-        if key in cells:
-            cells[key].episodes.extend(e.episodes)
-        else:
-            cells[key] = replace(e, episodes=list(e.episodes))
+        cells.setdefault(key, replace(e, episodes=[])).episodes.extend(e.episodes)
     return list(cells.values())

@@ -19,12 +19,7 @@ from gymnasium.vector import AutoresetMode
 from elastic_env.core.errors import ElasticError
 from elastic_env.core.signals import Array, BoolArray
 from train.evaluate.conditions import SCENARIO, Condition
-from train.evaluate.rollout import (
-    can_share_worlds,
-    control_steps,
-    make_policy,
-    make_shared_env,
-)
+from train.evaluate.rollout import can_share_worlds, control_steps, make_policy, make_shared_env
 
 Causes = npt.NDArray[np.str_]
 """Causes of failure of episodes; empty for an episode that did not fail."""

@@ -167,10 +167,8 @@ def _opponents(
         changes = {"name": name, "label": label, "options": options, "track": None}
         return residual.replace(**changes)
 
-    candidates = policies_named(description.base)
-    same = [policy for policy in candidates if _without_none(policy.options) == options]
-    role = f"base of {residual.title}"
-    base = same[0] if same else new_policy(description.base, role, options)
+    same = [p for p in policies_named(description.base) if _without_none(p.options) == options]
+    base = same[0] if same else new_policy(description.base, f"base of {residual.title}", options)
     policies = [*policies, base]
     environment = ENVIRONMENTS.get(description.robot)
     best = best_analytic(environment is not None and environment.walks)

@@ -60,11 +60,6 @@ def robot_scores(evaluations: Sequence[Evaluation]) -> list[RobotScores]:
             is_small = len(set(rows["seed"])) < FEWEST_ROBOTS
             if scope.swept or is_small or not scope.first.draws_robots:
                 continue
-            opponent_rows = {
-                title: table.rows_of(title, cell)
-                for title in others
-                if (title, cell) in table.conditions
-            }
             failed, episodes = failures(rows)
             for column in table.environment.judged:
                 scores = RobotScores(
@@ -76,8 +71,9 @@ def robot_scores(evaluations: Sequence[Evaluation]) -> list[RobotScores]:
                     failed=failed,
                     episodes=episodes,
                     better={
-                        title: share_better(rows, theirs, column.metric)
-                        for title, theirs in opponent_rows.items()
+                        title: share_better(rows, table.rows_of(title, cell), column.metric)
+                        for title in others
+                        if (title, cell) in table.conditions
                     },
                 )
                 result.append(scores)

@@ -61,11 +61,7 @@ class Estimate:
     @property
     def over(self) -> str:
         """Units of the interval: "10 training seeds and 64 robots"; empty without one."""
-        units = {
-            "training seeds": self.seeds,
-            "robots": self.robots,
-            "episodes": self.episodes,
-        }
+        units = {"training seeds": self.seeds, "robots": self.robots, "episodes": self.episodes}
         return " and ".join(f"{number} {unit}" for unit, number in units.items() if number)
 
     @property

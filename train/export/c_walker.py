@@ -14,12 +14,7 @@ import numpy as np
 from baselines.adaptation.estimators import ASSUMED_LOADS
 from baselines.compensation.compensators import Compensated
 from baselines.compensation.contact_torque import ContactGravity
-from baselines.estimation.bending import (
-    DISAGREEMENT_RAD,
-    LOADED_SHARE,
-    MODEL_ERROR,
-    OFFSET_RAD,
-)
+from baselines.estimation.bending import DISAGREEMENT_RAD, LOADED_SHARE, MODEL_ERROR, OFFSET_RAD
 from elastic_env.core.signals import Array
 from elastic_env.world.robot_model import WalkerModel
 from train.export.c_text import (
@@ -43,9 +38,7 @@ _CONTROLLER_CONSTANTS = (
     " force_difference force_difference_decay_s force_difference_limit_m dcm zmp_limit_m"
     " friction_rate_rad_s"
 )
-_POSTURE_GAINS = (
-    "proportional integral derivative leak_s trim integral_limit filter_share swing_share"
-)
+_GAINS = "proportional integral derivative leak_s trim integral_limit filter_share swing_share"
 
 
 def c_walker(policy: Any, prefix: str) -> str:
@@ -124,7 +117,7 @@ def _adaptive_tables(layers: WalkerLayers) -> dict[str, str]:
     carried = adaptive.estimator.observer.carried
     mass, point = _masses_below_sensors(layers.model)
     constants = {
-        **{name: gains[name] for name in _POSTURE_GAINS.split()},
+        **{name: gains[name] for name in _GAINS.split()},
         "turn_limit": gains["limit_rad"],
         "correction_limit": adaptive.limit,
         "correction_share": adaptive.share,

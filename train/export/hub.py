@@ -14,12 +14,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
-from baselines.residual.residual_policy import (
-    DESCRIPTION,
-    WEIGHTS,
-    find_folder,
-    load_residual,
-)
+from baselines.residual.residual_policy import DESCRIPTION, WEIGHTS, find_folder, load_residual
 from baselines.residual.settings import ResidualDescription
 from elastic_env.core.errors import (
     ConfigurationError,

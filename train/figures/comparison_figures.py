@@ -83,11 +83,8 @@ def draw_maps(
     maps: Sequence[HeatMap], folder: Path, figure_format: FigureFormat = "png"
 ) -> list[Path]:
     """Draw the maps of a comparison, a picture per scenario, motion and metric."""
-    files = []
-    for heat_map in maps:
-        name = _file_name(f"{heat_map.title}_{heat_map.column.metric}")
-        files.append(draw_map(heat_map, folder / f"map_{name}.{figure_format}"))
-    return files
+    names = [_file_name(f"map_{m.title}_{m.column.metric}.{figure_format}") for m in maps]
+    return [draw_map(m, folder / name) for m, name in zip(maps, names, strict=True)]
 
 
 def draw_signals(

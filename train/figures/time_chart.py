@@ -52,8 +52,8 @@ def time_chart(
         own_legend = titles if len(parts) > 1 else ()
         panels.append(Panel(signal.label, curves, limits, own_legend=own_legend))
     single = longest.get("single_support", np.zeros(len(time_s)))
-    shaded = intervals(single, time_s)
-    return Chart("", "time [s]", panels, shaded=shaded, marks=_time_marks(longest))
+    marks = _time_marks(longest)
+    return Chart("", "time [s]", panels, shaded=intervals(single, time_s), marks=marks)
 
 
 def _split_policies(

@@ -68,9 +68,8 @@ class MixedVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         n = self.num_envs = ends[-1]
         self._weights = np.ones(n) if weights is None else np.array(weights)
         if self._weights.shape != (n,):
-            raise ConfigurationError(
-                f"weights must be one per world, {n}, got {len(self._weights)}"
-            )
+            count = len(self._weights)
+            raise ConfigurationError(f"weights must be one per world, {n}, got {count}")
         self.autoreset_mode = AutoresetMode.DISABLED
         self.metadata = {"autoreset_mode": self.autoreset_mode}
         self.single_observation_space = envs[0].single_observation_space

@@ -94,9 +94,8 @@ class SB3VecEnv(VecEnv):
             metrics = final.get("episode_metrics", {})
             scored = final.get("_episode_metrics", done)
             for world in np.flatnonzero(done).tolist():
-                own_metrics = {
-                    name: values[world].item() for name, values in metrics.items() if scored[world]
-                }
+                recorded = metrics if scored[world] else {}
+                own_metrics = {name: values[world].item() for name, values in recorded.items()}
                 is_cut = bool(truncated[world] and not terminated[world])
                 infos[world] = {
                     "terminal_observation": info["final_obs"][world],

@@ -28,12 +28,7 @@ from train.learn.critic import AsymmetricPolicy
 from train.learn.export import algorithm_class, explain_option_errors, network_of
 from train.learn.sb3_env import SB3VecEnv
 from train.learn.tensorboard_curves import RewardLogger, hide_thread_errors
-from train.learn.train_config import (
-    FIRST_TRAINING_SEED,
-    first_episode,
-    joints_of,
-    training_worlds,
-)
+from train.learn.train_config import FIRST_TRAINING_SEED, first_episode, joints_of, training_worlds
 from train.learn.trainer import Trainer, require_finite
 
 _MODEL_ATTRIBUTES = ("num_timesteps", "_n_updates", "_episode_num")
