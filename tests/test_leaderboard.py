@@ -478,7 +478,7 @@ def test_a_policy_of_ones_own_stands_beside_published_ones_that_do_not_play(
     capsys.readouterr()
     assert "'uncompensated' is published already; name your own by --policies" in refused(words)
     more = refused([*mine[:-1], "more", "--episodes", "2"])
-    assert "published rows must be played as one's own" in more
+    assert "published rows and your own must have the same version and protocol" in more
     text = published.read_text()
     published.write_text(text.replace("mujoco 4", "mujoco 3"))
     assert "there by elastic-env" in refused([*mine[:-1], "other"])

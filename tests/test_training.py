@@ -617,7 +617,7 @@ def test_walks_that_are_learned_from_have_other_lengths_than_those_of_evaluation
     assert evaluated.task.num_substeps == 4
     walk = {"step_period": 3, "num_steps": 4}
     with pytest.raises(
-        ConfigurationError, match=r"must not say what the reference does: num_steps"
+        ConfigurationError, match=r"must not repeat keys of the reference: num_steps"
     ):
         TrainConfig(reference=walk, training_options={"num_steps": 20})
 

@@ -85,7 +85,7 @@ def evaluate(
 ) -> Evaluation:
     """Play all episodes of a condition.
 
-    Episode i has seed + i, whatever the number of worlds and threads.
+    Episode i has seed + i, with any number of worlds and threads.
 
     A policy with a method `rehearse(env, seed)` gets the environment before it is scored. It may
     play episodes of the robots that it is scored on, under other noise, see

@@ -110,8 +110,8 @@ def _require_one_family(pattern: str, members: Sequence[ResidualFolder]) -> None
                 )
         if seed is None:
             raise ConfigurationError(
-                f"{folder} does not say its training seed: residual.json has no training.seed and"
-                " the path no seed_N"
+                f"{folder} has no training seed: residual.json has no training.seed and the path no"
+                " seed_N"
             )
         if seed in seen:
             raise ConfigurationError(

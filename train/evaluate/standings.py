@@ -94,8 +94,9 @@ def append_standings(published: Sequence[Standing], own: Sequence[Standing]) -> 
     if theirs.keys() != ours.keys():
         there, here = (" and ".join(origins) or "nothing" for origins in (theirs, ours))
         raise ConfigurationError(
-            f"published rows must be played as one's own, there by {there or 'an unknown version'},"
-            f" here by {here}; the protocol is motions, scenarios, groups, episodes and seed"
+            "published rows and your own must have the same version and protocol, got"
+            f" {there or 'an unknown version'} and {here}; the protocol is motions, scenarios,"
+            " groups, episodes and seed"
         )
     policies = {row.policy for row in published}
     marked = [replace(row, is_published=True) for row in published]

@@ -175,10 +175,10 @@ class EpisodeTable:
             yield self.scope(policy, cell)
             block = blocks[motion(cell)]
             if cell == block[-1]:
-                cell_of = {self.conditions[policy, each].scenario: each for each in block}
+                cells_by_scenario = {self.conditions[policy, n].scenario: n for n in block}
                 for name, scenarios in groups.items():
-                    if cell_of.keys() >= set(scenarios):
-                        members = [cell_of[scenario] for scenario in scenarios]
+                    if cells_by_scenario.keys() >= set(scenarios):
+                        members = [cells_by_scenario[scenario] for scenario in scenarios]
                         yield self.scope(policy, *members, group=name)
 
     def cells_of_base(self, scope: Scope, base: str) -> list[int]:

@@ -28,7 +28,7 @@ SIGNS = {"none": "*", "unclear": "?"}
 """Signs behind a change that is not shown, by its verdict."""
 SIGNS_ARE = (
     "A star: the interval includes zero. A question mark: too few training seeds, robots or"
-    " episodes to say."
+    " episodes to decide."
 )
 
 _SHOWN_WITH_DECIMAL = 0.0995

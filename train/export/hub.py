@@ -183,7 +183,7 @@ def _require_small(hub: Any, repository: str, revision: str) -> None:
             )
         size = sizes[name]
         if size is None or not 0 < size <= most:
-            problem = "says no size" if size is None else f"has {size}"
+            problem = "has no size" if size is None else f"has {size}"
             raise ConfigurationError(
                 f"{name} of {shorten(repository)} must have 1 to {most} bytes, it {problem}"
             )
@@ -205,7 +205,7 @@ def _check_files(
     if digest is not None and digest != actual:
         raise ConfigurationError(
             f"the weights of {shorten(repository)} have the SHA-256 digest {actual}, and --sha256"
-            f" {quote(digest)[1:-1]} was asked for; ask who pushed it which one is right"
+            f" {quote(digest)[1:-1]} was asked for; ask its author which one is right"
         )
     return description
 

@@ -170,7 +170,7 @@ def _column_names(fit: ArmFit) -> tuple[str, ...]:
 
 def _stiffness_text(joint: Any) -> str:
     if joint.stiffness_high_nm_per_rad is None:
-        return "not told apart"
+        return "K not identified"
     bound = f"± {100 * joint.half_width:.2g} %"
     return f"K = {joint.stiffness_nm_per_rad:.4g} N·m/rad {bound}"
 

@@ -1,8 +1,8 @@
 """A checkpoint: a folder that is written completely or not at all, and read only if complete.
 
 It lists its files with their SHA-256 digests, which are checked before anything is loaded. A digest
-detects damage by a full or failing disk. It does not protect against somebody who changes files and
-digests.
+detects damage by a full or failing disk. It does not protect against an attacker who changes files
+and digests.
 """
 
 import json

@@ -34,9 +34,9 @@ def algorithm_class(name: str) -> Any:
             return named_object(name)
         except ConfigurationError as error:
             raise ConfigurationError(f"algorithm {name!r}: {error}") from error
-    known = ("A2C", "PPO", "SAC")
-    if name not in known:
-        raise unknown_name("algorithm", name, [*known, CONSTANTS, "module:Class"])
+    names = ("A2C", "PPO", "SAC")
+    if name not in names:
+        raise unknown_name("algorithm", name, [*names, CONSTANTS, "module:Class"])
     return getattr(stable_baselines3, name)
 
 

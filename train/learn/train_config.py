@@ -105,8 +105,8 @@ class TrainConfig(CodeNamingModel):
         motion = self.reference if isinstance(self.reference, dict) else {}
         if twice := sorted(motion.keys() & self.training_options.keys()):
             raise ValueError(
-                f"training_options must not say what the reference does: {', '.join(twice)}; name"
-                " in the reference what trainings and evaluations have in common"
+                f"training_options must not repeat keys of the reference: {', '.join(twice)}; set"
+                " in the reference what trainings and evaluations share"
             )
         return self
 
