@@ -142,9 +142,9 @@ class Condition(Model):
     member: Member | None = None
     """Training seed and base of a residual; None for another policy."""
     reference: GivenReference = None
-    """The motion: on the testbed a name or a mapping with `kind`, on the walker a step period [s],
-    three durations [s], or a mapping with `step_period` and further arguments of the environment;
-    None for the environment's default."""
+    """The motion; None for the environment's default. On the testbed: a name or a mapping with
+    `kind`. On the walker: a step period [s], three durations [s], or a mapping with `step_period`
+    and further arguments of the environment."""
     label: str | None = None
     """Name of the reference in tables and figures; None for the environment's name."""
     scenario: Title = "nominal"

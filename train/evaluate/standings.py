@@ -111,8 +111,8 @@ def standings(
 ) -> list[Standing]:
     """The leaderboard, a row per policy, motion, scope and judged metric.
 
-    Each motion has a column for every group whose scenarios are all played with it, and for every
-    scenario that is in none of these groups.
+    Each motion has a column for every group whose scenarios are all played with it. Scenarios in
+    none of these groups have columns of their own.
 
     Args:
         evaluations: All cells, one per training seed.

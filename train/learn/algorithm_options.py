@@ -96,7 +96,7 @@ class _SACNetwork(_NetworkOptions):
     clip_mean: float = quantity("1", 2.0, ge=0, le=100)
     """Bound of the mean before tanh."""
     n_critics: int = quantity("1", 2, ge=1, le=16)
-    """Critics."""
+    """Number of critics."""
 
 
 class _OnPolicy(_Options):
@@ -150,19 +150,19 @@ class _SAC(_Options):
     batch_size: int = quantity("1", 512, ge=1, le=10**7)
     """Decisions in a minibatch."""
     buffer_size: int = quantity("1", 200_000, ge=1, le=10**7)
-    """Decisions that are kept."""
+    """Decisions in the replay buffer."""
     learning_starts: int = quantity("1", 2_000, ge=0, le=10**9)
     """Decisions before the first update."""
     train_freq: int = quantity("1", 4, ge=1, le=10**6)
     """Decisions of every world between updates."""
     gradient_steps: int = quantity("1", 8, ge=-1, le=10_000)
-    """Steps of an update, -1: as decisions."""
+    """Steps of an update; -1: one per decision."""
     tau: float = quantity("1", 0.005, ge=0, le=1)
-    """Share of the critic that its target takes on."""
+    """Share of the critic in a change of its target."""
     target_update_interval: int = quantity("1", 1, ge=1, le=10**6)
     """Steps between changes of the target."""
     target_entropy: Literal["auto"] | Annotated[float, Field(ge=-1e6, le=1e6)] = "auto"
-    """Entropy at which a learned weight aims."""
+    """Target of the entropy for a learned weight."""
     n_steps: int = quantity("1", 1, ge=1, le=1000)
     """Decisions of a return."""
     policy_kwargs: _SACNetwork = _SACNetwork()

@@ -16,10 +16,10 @@ _EMPTY_INFO: dict[str, Any] = {}
 class SB3VecEnv(VecEnv):
     """A Gymnasium vector environment with same-step autoreset as an SB3 `VecEnv`.
 
-    Terminal observations, time limits (`TimeLimit.truncated`) and episode statistics (`episode`:
-    reward r, length l in steps of this environment, and the metrics of the task) are in the infos
-    of the worlds that end, as SB3 expects. A first episode that is cut short has no statistics, as
-    its sum of rewards is not that of a complete episode.
+    As SB3 expects, the infos of worlds that end have the terminal observation, the time limit
+    (`TimeLimit.truncated`) and the metrics of the task. They also have the statistics of the
+    `episode`: its reward r, and its length l in steps of this environment. A first episode that is
+    cut short has no statistics, since its sum of rewards is not that of a complete episode.
 
     Args:
         env: Environment with `autoreset_mode=SAME_STEP`, such as a `ResidualVectorWrapper`.
