@@ -84,10 +84,8 @@ class Estimate:
 
     def times(self, factor: float) -> "Estimate":
         """Return the estimate in another unit; the factor is positive."""
-        ends: dict[str, Any] = {}
-        if self.low is not None and self.high is not None:
-            ends = {"low": factor * self.low, "high": factor * self.high}
-        return replace(self, value=factor * self.value, **ends)
+        low, high = (None if end is None else factor * end for end in (self.low, self.high))
+        return replace(self, value=factor * self.value, low=low, high=high)
 
 
 def change(mine: Array, base: Array) -> Array:

@@ -100,14 +100,13 @@ def _random_observations(
 def _sensor_fields(layers: WalkerLayers, rows: Array) -> list[Array]:
     """Fields of the struct `shown` from observations."""
     table = layers.model.observation_table
-    names = ("reference_angle", "reference_rate")
     sensors = [rows[:, table.group(name)] for name in ("encoder_angle", "imu_attitude")]
     if layers.posture is None:
         sensors.append(rows[:, table.columns(*_FORCES)])
     else:
         sensors.append(rows[:, table.group("imu_rate")][:, :2])
         sensors.append(rows[:, table.group("wrench")].reshape(len(rows), 2, 6))
-    reference = [rows[:, table.group(name)] for name in names]
+    reference = [rows[:, table.group(name)] for name in ("reference_angle", "reference_rate")]
     share = rows[:, table.group("load_share")][:, 0]
     support: Any = rows[:, table.columns("clock.support")][:, 0].astype(np.int64)
     zmp = rows[:, table.group("zmp_reference")]

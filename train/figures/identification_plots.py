@@ -69,14 +69,14 @@ def draw_identification(
     bounds = f"{result.stiffness_low_nm_per_rad:.1f} to {result.stiffness_high_nm_per_rad:.1f}"
     K = f"K = {result.stiffness_nm_per_rad:.1f} N·m/rad"
     top.set_title(f"{K}, 95 % interval {bounds}")
-    found = (
+    texts = (
         f"friction {result.friction_nm:.2f} N·m",
         f"dead band {MRAD * result.dead_band_rad:.2f} mrad",
         f"offset {MRAD * result.offset_rad:+.2f} mrad",
         f"Pearson r {result.pearson_r:.4f}",
     )
     place = {"transform": top.transAxes, "va": "top", "fontsize": 9}
-    top.text(0.03, 0.95, "\n".join(found), **place)
+    top.text(0.03, 0.95, "\n".join(texts), **place)
     top.set_ylabel("deflection θ − q [mrad]")
     top.legend(loc="lower right")
     bottom.axhline(0.0, color=_LINE_COLOUR, lw=0.8)

@@ -13,7 +13,7 @@ from elastic_env.core.files import write_whole
 from train.evaluate.environments import Column
 from train.evaluate.episodes import Evaluation
 from train.evaluate.scores import median_of
-from train.figures.chart import Chart, Curve, Evaluations, Mark
+from train.figures.chart import Chart, Curve, Evaluations, Mark, Panel
 from train.figures.colours import FAILED, INK, policy_colours
 from train.runs.escaping import visible
 
@@ -85,25 +85,10 @@ def draw_chart(chart: Chart, path: Path) -> Path:
         shade = {"color": "#e9ebee", "lw": 0, "zorder": 0, "label": chart.shade_name}
         for begin, end in chart.shaded:
             axis.axvspan(begin, end, **shade)
-        for curve in panel.curves:
-            _draw_curve(axis, curve, panel.limits)
-        axis.set_ylabel(panel.label)
+        _draw_panel(axis, panel)
         axis.grid(axis="x", visible=chart.ticks is not None)
-        if panel.is_log:
-            axis.set_yscale("log")
-            show_numbers(axis.yaxis)
-        if panel.limits is not None:
-            axis.set_ylim(*panel.limits)
-        if panel.rows:
-            names = [label_text(row) for row in panel.rows]
-            axis.set_yticks(range(len(names)), names, fontsize=8)
-            axis.grid(axis="y", visible=False)
-        elif panel.limits is not None and panel.limits[0] < 0.0 < panel.limits[1]:
-            axis.axhline(0.0, color="#777777", lw=0.8, zorder=1)
         if chart.ticks is None:
             axis.margins(x=0.0)
-        if panel.own_legend:
-            _add_legend(axis, panel.own_legend)
     if chart.ticks is not None:
         axes[-1].set_xscale("log")
         axes[-1].set_xticks(chart.ticks, [f"{value:g}" for value in chart.ticks])
@@ -114,6 +99,38 @@ def draw_chart(chart: Chart, path: Path) -> Path:
     axes[-1].set_xlabel(chart.label)
     if any(curve.fails for panel in chart.panels for curve in panel.curves):
         axes[-1].scatter([], [], marker="X", s=60, color=FAILED, label="fall")
+    entries = _common_entries(axes, chart)
+    figure.align_ylabels(axes)
+    ncols = legend_columns(len(entries))
+    figure.legend(entries.values(), entries.keys(), ncols=ncols, loc="outside lower center")
+    return save(figure, path)
+
+
+def _draw_panel(axis: Any, panel: Panel) -> None:
+    """Draw the curves of a panel, its y axis, and its own legend to the right."""
+    for curve in panel.curves:
+        _draw_curve(axis, curve, panel.limits)
+    axis.set_ylabel(panel.label)
+    if panel.is_log:
+        axis.set_yscale("log")
+        show_numbers(axis.yaxis)
+    if panel.limits is not None:
+        axis.set_ylim(*panel.limits)
+    if panel.rows:
+        names = [label_text(row) for row in panel.rows]
+        axis.set_yticks(range(len(names)), names, fontsize=8)
+        axis.grid(axis="y", visible=False)
+    elif panel.limits is not None and panel.limits[0] < 0.0 < panel.limits[1]:
+        axis.axhline(0.0, color="#777777", lw=0.8, zorder=1)
+    if panel.own_legend:
+        entries = _legend_entries(axis)
+        names = [label_text(title) for title in panel.own_legend]
+        place = {"loc": "center left", "bbox_to_anchor": (1.0, 0.5)}
+        axis.legend([entries[name] for name in names], names, fontsize=8, **place)
+
+
+def _common_entries(axes: Sequence[Any], chart: Chart) -> dict[str, Any]:
+    """Entries of the legend below a chart: those that no panel has in its own legend."""
     entries = {}
     for axis in axes:
         entries |= _legend_entries(axis)
@@ -121,24 +138,13 @@ def draw_chart(chart: Chart, path: Path) -> Path:
         entries.pop(label_text(title), None)
     if chart.shade_name in entries:  # the shade comes after the curves
         entries[chart.shade_name] = entries.pop(chart.shade_name)
-    figure.align_ylabels(axes)
-    ncols = legend_columns(len(entries))
-    figure.legend(entries.values(), entries.keys(), ncols=ncols, loc="outside lower center")
-    return save(figure, path)
+    return entries
 
 
 def _legend_entries(axis: Any) -> dict[str, Any]:
     """Handles of an axis by their labels."""
     handles, labels = axis.get_legend_handles_labels()
     return dict(zip(labels, handles, strict=True))
-
-
-def _add_legend(axis: Any, titles: Sequence[str]) -> None:
-    """Add a legend of some curves to the right of a panel."""
-    entries = _legend_entries(axis)
-    names = [label_text(title) for title in titles]
-    place = {"loc": "center left", "bbox_to_anchor": (1.0, 0.5)}
-    axis.legend([entries[name] for name in names], names, fontsize=8, **place)
 
 
 def _draw_mark(axes: Sequence[Any], mark: Mark) -> None:
@@ -191,19 +197,10 @@ def draw_overview(evaluations: Evaluations, columns: Sequence[Column], path: Pat
     episodes, crosses are failed ones.
     """
     environment = evaluations[0].condition.environment
-    titles = list(dict.fromkeys(e.condition.policy.title for e in evaluations))
-    shades = policy_colours(titles)
+    shades = policy_colours([e.condition.policy.title for e in evaluations])
     is_one_scenario = len({e.condition.scenario for e in evaluations}) == 1
-    panels: dict[str, dict[str, list[Evaluation]]] = {}
-    for e in evaluations:
-        reference = e.condition.reference_name
-        outer = environment.title(reference)
-        inner = e.condition.scenario
-        if is_one_scenario:
-            outer = f"scenario {inner}"
-            inner = reference
-        panels.setdefault(outer, {}).setdefault(inner, []).append(e)
-    group_width = 0.35 + 0.14 * len(titles)
+    panels = _group_bars(evaluations, is_one_scenario)
+    group_width = 0.35 + 0.14 * len(shades)
     width = 1.2 + max(3.0, group_width * max(map(len, panels.values())))
     is_stacked = width * len(panels) > _LARGEST_WIDTH
     per_row = 1 if is_stacked else len(panels)
@@ -222,20 +219,43 @@ def draw_overview(evaluations: Evaluations, columns: Sequence[Column], path: Pat
             axis.set_ylabel(column.label if axis.get_subplotspec().is_first_col() else "")
     if is_one_scenario and environment.quantity:
         axes[-per_row].set_xlabel(environment.quantity)
-    bar = axes[0].bar
-    names = {label_text(title): shade for title, shade in shades.items()}
-    handles = [bar(np.nan, 0.0, color=c, label=name) for name, c in names.items()]
-    if any(evaluation.num_failed for evaluation in evaluations):
-        cross = {"marker": "X", "s": 26, "color": FAILED, "label": environment.failure}
-        handles.append(axes[0].scatter([], [], **cross))
-    if any(len(evaluation.episodes) > 1 for evaluation in evaluations):
-        handles.append(axes[0].scatter([], [], label="episode (bar: median)", **_DOT_STYLE))
-    if any(median_of(e, column.metric).has_interval for e in evaluations for column in columns):
-        style = {"marker": "|", "lw": 0.0, "ms": 9, "mew": _INTERVAL_STYLE["lw"], "color": INK}
-        handles += axes[0].plot([], [], label="95 % interval of the median", **style)
+    handles = _overview_handles(axes[0], evaluations, columns, shades)
     ncols = legend_columns(len(handles), max(int(size[0] / 1.7), 2))
     figure.legend(handles=handles, ncols=ncols, loc="outside lower center")
     return save(figure, path)
+
+
+def _group_bars(
+    evaluations: Evaluations, is_one_scenario: bool
+) -> dict[str, dict[str, list[Evaluation]]]:
+    """Evaluations by panel and group: reference and scenario, or scenario and reference."""
+    panels: dict[str, dict[str, list[Evaluation]]] = {}
+    for e in evaluations:
+        reference = e.condition.reference_name
+        panel = e.condition.environment.title(reference)
+        group = e.condition.scenario
+        if is_one_scenario:
+            panel = f"scenario {group}"
+            group = reference
+        panels.setdefault(panel, {}).setdefault(group, []).append(e)
+    return panels
+
+
+def _overview_handles(
+    axis: Any, evaluations: Evaluations, columns: Sequence[Column], shades: Mapping[str, str]
+) -> list[Any]:
+    """Handles of the legend: policies, and failures, episodes and intervals if there are any."""
+    names = {label_text(title): shade for title, shade in shades.items()}
+    handles = [axis.bar(np.nan, 0.0, color=c, label=name) for name, c in names.items()]
+    if any(e.num_failed for e in evaluations):
+        failure = evaluations[0].condition.environment.failure
+        handles.append(axis.scatter([], [], marker="X", s=26, color=FAILED, label=failure))
+    if any(len(e.episodes) > 1 for e in evaluations):
+        handles.append(axis.scatter([], [], label="episode (bar: median)", **_DOT_STYLE))
+    if any(median_of(e, column.metric).has_interval for e in evaluations for column in columns):
+        style = {"marker": "|", "lw": 0.0, "ms": 9, "mew": _INTERVAL_STYLE["lw"], "color": INK}
+        handles += axis.plot([], [], label="95 % interval of the median", **style)
+    return handles
 
 
 _DOT_STYLE: dict[str, Any] = {"s": 4, "color": "#222222", "alpha": 0.45, "lw": 0, "zorder": 3}
