@@ -18,14 +18,14 @@ import train.speed.step_times
 from baselines.catalogue import Track
 from elastic_env.core.config import load_yaml
 from elastic_env.core.errors import ConfigurationError
-from tests.cells import METRIC, cell, family
+from tests.cells import METRIC, cell, family, over_seeds
 from train.commands.cli import main
 from train.commands.compare import CompareConfig, Sweep
 from train.evaluate.changes import changes
 from train.evaluate.conditions import Condition, PolicySpec
 from train.evaluate.episodes import Evaluation, evaluate
 from train.evaluate.standings import PairedChange, Standing, standings
-from train.evaluate.statistics import Estimate, over_seeds
+from train.evaluate.statistics import Estimate
 from train.report.leaderboard import (
     board,
     claims_table,

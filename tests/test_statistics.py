@@ -8,7 +8,7 @@ import pytest
 from scipy import stats
 
 from elastic_env.core.signals import Array
-from tests.cells import METRIC, cell, family
+from tests.cells import METRIC, cell, family, over_seeds
 from train.evaluate import statistics
 from train.evaluate.changes import changes
 from train.evaluate.scores import over_cells, per_robot, score
@@ -42,11 +42,6 @@ COVERAGES = 200
 def _folders_of_residuals_elsewhere(tmp_path: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """Families are folders in the working directory."""
     monkeypatch.chdir(tmp_path)
-
-
-def over_seeds(values: Array) -> Estimate:
-    """Interquartile mean over training seeds."""
-    return estimate(lambda _: values[None], ())
 
 
 @pytest.mark.parametrize("number", [2, 5, 10])
