@@ -13,7 +13,7 @@ import pytest
 
 from elastic_env.core.errors import ElasticError
 from tests.test_training import PPO, SMALL, interrupted_after
-from train.learn.checkpoint import recover_checkpoint, require_whole, write_checkpoint
+from train.learn.checkpoint import recover_checkpoint, require_complete, write_checkpoint
 from train.learn.train_config import TrainConfig
 from train.learn.training import Training
 from train.runs.failures import SYSTEM_FAILED, explain
@@ -79,14 +79,14 @@ def test_a_mutated_checkpoint_is_refused_before_it_is_read(trained: Path, tmp_pa
     """Catches a file that is read without its digest, and a digest that misses some change."""
     chance = random.Random(26)
     path = tmp_path / "checkpoint"
-    require_whole(trained / "checkpoint")
+    require_complete(trained / "checkpoint")
     for _ in range(MUTATIONS):
         shutil.copytree(trained / "checkpoint", path, dirs_exist_ok=True)
         file = chance.choice(sorted(path.iterdir()))
         mutate = chance.choice([flip, cut, repeat, renumber, remove, rename, replace])
         mutate(file, chance)
-        with pytest.raises(ElasticError, match=r"damaged or not whole .*; remove it"):
-            require_whole(path)
+        with pytest.raises(ElasticError, match=r"damaged or incomplete .*; remove it"):
+            require_complete(path)
         shutil.rmtree(path)
 
 
@@ -97,7 +97,7 @@ def test_a_failure_on_the_way_leaves_the_checkpoint_before_it(tmp_path: Path) ->
     with pytest.raises(TypeError):
         write(checkpoint, None)  # type: ignore[arg-type]
     assert recover_checkpoint(checkpoint)
-    require_whole(checkpoint)
+    require_complete(checkpoint)
     assert (checkpoint / "one").read_text() == "first"
     write(checkpoint, "third")
     assert (checkpoint / "one").read_text() == "third"
@@ -110,7 +110,7 @@ def test_a_kill_between_the_moves_loses_nothing(tmp_path: Path) -> None:
     write(checkpoint, "first")
     checkpoint.rename(tmp_path / "checkpoint.old")
     assert recover_checkpoint(checkpoint)
-    require_whole(checkpoint)
+    require_complete(checkpoint)
 
 
 def test_no_thread_goes_on_writing_behind_a_training_that_was_ended(tmp_path: Path) -> None:
@@ -175,4 +175,4 @@ def test_a_file_of_a_terabyte_is_refused_unread(tmp_path: Path) -> None:
     with (checkpoint / "model.pt").open("r+b") as file:
         file.truncate(2**40)
     with pytest.raises(ElasticError, match=r"model.pt must have at most 2e\+09 bytes"):
-        require_whole(checkpoint)
+        require_complete(checkpoint)

@@ -9,9 +9,10 @@ from PIL import Image
 from train.evaluate.conditions import Condition
 from train.evaluate.environments import TracedSignal
 from train.evaluate.episodes import Evaluation, evaluate
-from train.figures.chart import Chart, Curve, Panel, time_chart
+from train.figures.chart import Chart, Curve, Panel
 from train.figures.comparison_figures import figure_name
 from train.figures.plots import draw_chart
+from train.figures.time_chart import time_chart
 
 TIME = np.linspace(0.0, 5.0, 101)
 ANGLE = TracedSignal("angle", "angle", "rad", reference="wanted")
@@ -41,7 +42,7 @@ def test_a_panel_holds_few_lines_of_like_errors() -> None:
         ["b", "d", "e"],
         ["c", "a"],
     ]
-    assert [panel.own for panel in chart.panels] == 2 * [["b", "d", "e"], ["c", "a"]]
+    assert [panel.own_legend for panel in chart.panels] == 2 * [["b", "d", "e"], ["c", "a"]]
     low, high = chart.panels[3].limits or (0.0, 0.0)
     assert high - low == pytest.approx(4.0, rel=0.2)  # [mrad], of "c" and not of "b"
     (panel, _) = time_chart(policies, [ANGLE, ERROR], colours).panels

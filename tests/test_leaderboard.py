@@ -18,14 +18,14 @@ import train.speed.step_times
 from baselines.catalogue import Track
 from elastic_env.core.config import load_yaml
 from elastic_env.core.errors import ConfigurationError
-from tests.cells import METRIC, cell, family
+from tests.cells import METRIC, cell, family, over_seeds
 from train.commands.cli import main
 from train.commands.compare_config import CompareConfig, Sweep
 from train.evaluate.changes import changes
 from train.evaluate.conditions import Condition, PolicySpec
 from train.evaluate.episodes import Evaluation, evaluate
-from train.evaluate.standings import Paired, Standing, standings
-from train.evaluate.statistics import Estimate, over_seeds
+from train.evaluate.standings import PairedChange, Standing, standings
+from train.evaluate.statistics import Estimate
 from train.report.leaderboard import (
     claims_table,
     find_published,
@@ -101,7 +101,7 @@ def row(policy: str, scope: str, reference: str = "3 s") -> Standing:
     )
 
 
-def change_to(paired: Paired | None) -> Estimate:
+def change_to(paired: PairedChange | None) -> Estimate:
     """A paired change that is there."""
     assert paired is not None
     return paired.change
@@ -148,7 +148,7 @@ def test_changes_to_the_base_are_those_of_the_statistics() -> None:
             for c in changes(found, GROUPS)
             if (c.policy, c.scope, c.reference, c.column.metric) == name
         ]
-        assert row("learned", scope).base == Paired("base", own.relative, own.verdict)
+        assert row("learned", scope).base == PairedChange("base", own.relative, own.verdict)
     assert (row("base", "both").base, row("base", "both").rival) == (None, None)
 
 
@@ -156,7 +156,7 @@ def test_a_residual_is_compared_with_the_best_of_each_column() -> None:
     """Catches one rival for all columns, one that falls, one with further sensors, and changes
     of single scenarios."""
     rivals = {scope: row("learned", scope).rival for scope in ("soft", "both", "ideal", "slope")}
-    assert {scope: rival and rival.to for scope, rival in rivals.items()} == {
+    assert {scope: rival and rival.opponent for scope, rival in rivals.items()} == {
         "soft": "base",
         "both": "base",
         "ideal": "best",
@@ -478,7 +478,7 @@ def test_a_policy_of_ones_own_stands_beside_published_ones_that_do_not_play(
     capsys.readouterr()
     assert "'uncompensated' is published already; name your own by --policies" in refused(words)
     more = refused([*mine[:-1], "more", "--episodes", "2"])
-    assert "published rows must be played as one's own" in more
+    assert "published rows and your own must have the same version and protocol" in more
     text = published.read_text()
     published.write_text(text.replace("mujoco 4", "mujoco 3"))
     assert "there by elastic-env" in refused([*mine[:-1], "other"])

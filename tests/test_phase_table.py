@@ -32,10 +32,10 @@ from train.learn.phase_table import (
     Play,
     Search,
     Walks,
-    best,
-    find,
-    next_table,
-    probe,
+    best_play,
+    correct_inputs,
+    find_table,
+    probe_inputs,
 )
 
 PERIOD_S = 1.1
@@ -160,11 +160,11 @@ def test_a_linear_plant_is_corrected_to_its_least_error() -> None:
 
     now = Harmonics(np.zeros(shape, dtype=np.complex128))
     for number in range(1, 12):
-        now = next_table(now, play(now), response, search)
+        now = correct_inputs(now, play(now), response, search)
         left = np.abs(play(now).planes) / np.abs(without)
         np.testing.assert_allclose(left, 0.5**number, rtol=1e-4)
     for channel in range(2):
-        known = probe(3, channel).planes
+        known = probe_inputs(3, channel).planes
         found = (play(Harmonics(known)).planes - without) / known[:, :, channel, None]
         np.testing.assert_allclose(found, response[..., channel])
 
@@ -177,7 +177,7 @@ def test_harmonics_become_the_same_signal_as_a_table() -> None:
     for i, name in enumerate(CHANNELS):
         is_odd = name in ("zmp_y", "hip_roll")
         columns[name] = np.linalg.pinv(harmonics(psi, 3, is_odd)) @ values[:, i]
-    again = Harmonics.of(columns).table(Search(step_period=PERIOD_S))
+    again = Harmonics.from_columns(columns).table(Search(step_period=PERIOD_S))
     np.testing.assert_allclose(again.values(psi), values, atol=1e-9)
     assert again.found_on != TABLE.found_on
 
@@ -213,7 +213,7 @@ def test_the_best_table_counts_and_not_the_last_one() -> None:
         Play(none, none, still | {"zmp_y": 1e-3, "fell": 1.0}),
     ]
     assert plays[0].cost == pytest.approx(4.0)
-    assert best(plays) is plays[1]
+    assert best_play(plays) is plays[1]
 
 
 @pytest.mark.slow
@@ -222,7 +222,7 @@ def test_a_search_lowers_the_error_of_its_robot() -> None:
     search = Search(step_period=PERIOD_S, scenario="soft", robots=1, strides=1, plays=2)
     walks = Walks(search)
     none = Harmonics(np.zeros((2, 4, 2), dtype=np.complex128))
-    left = [walks.errors(table)[1] for table in (none.table(search), find(search))]
+    left = [walks.errors(table)[1] for table in (none.table(search), find_table(search))]
     walks.env.close()
     assert left[0]["fell"] == left[1]["fell"] == 0.0
     zmp = [np.hypot(own["zmp_x"], own["zmp_y"]) for own in left]

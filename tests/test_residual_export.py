@@ -91,7 +91,7 @@ def inputs_of(session: Any, given: dict[str, Any]) -> dict[str, Any]:
 def test_the_graph_computes_what_python_does(case: str, tmp_path: Path) -> None:
     """Catches a transposed weight, a wrong activation, a lost mean, mirror or bound, and
     features in single precision."""
-    layout = ResidualLayout.of(residual(case, tmp_path / "r"))
+    layout = ResidualLayout.load(residual(case, tmp_path / "r"))
     session = onnxruntime.InferenceSession(onnx_model(layout))
     drawn = layout.draw(10_000, seed=5)
     found = session.run(None, inputs_of(session, drawn))
@@ -143,7 +143,7 @@ def walk(tmp_path_factory: pytest.TempPathFactory) -> Walk:
         rows.append((seen[0], on_right[0], state.residual[0], state.inner.values[0]))
         observation, _, terminated, truncated, _ = env.step(action)
         is_over = terminated or truncated
-    return Walk(ResidualLayout.of(name), *map(np.array, zip(*rows, strict=True)))
+    return Walk(ResidualLayout.load(name), *map(np.array, zip(*rows, strict=True)))
 
 
 def test_the_graph_decides_on_a_walk_as_the_policy_does(walk: Walk) -> None:
@@ -194,7 +194,7 @@ def played_in_c(
 @pytest.mark.parametrize("case", CASES)
 def test_the_header_computes_what_python_does(case: str, compiler: str, tmp_path: Path) -> None:
     """Catches what is wrong with a table, a layer, an activation or the mirror."""
-    layout = ResidualLayout.of(residual(case, tmp_path / "r"))
+    layout = ResidualLayout.load(residual(case, tmp_path / "r"))
     drawn = layout.draw(10_000, seed=2)
     found, _ = played_in_c(layout, compiler, tmp_path, **drawn)
     expected, _ = layout.decide(**drawn)
@@ -212,7 +212,7 @@ def test_the_header_corrects_on_a_walk_as_the_policy_does(
 
 
 def test_numbers_that_are_not_finite_change_nothing_in_c(tmp_path: Path) -> None:
-    layout = ResidualLayout.of(residual("testbed", tmp_path / "r"))
+    layout = ResidualLayout.load(residual("testbed", tmp_path / "r"))
     program = """#include "arm.h"
         int main(void) {
             double features[ARM_FEATURES] = {0.0};
@@ -227,7 +227,7 @@ def test_numbers_that_are_not_finite_change_nothing_in_c(tmp_path: Path) -> None
 
 
 def test_the_header_needs_no_heap(tmp_path: Path) -> None:
-    layout = ResidualLayout.of(residual("mirrored", tmp_path / "r"))
+    layout = ResidualLayout.load(residual("mirrored", tmp_path / "r"))
     function = """int all(arm_state *state, const double *features) {
         arm_begin(state);
         return arm_step(state, features, 1);
@@ -306,10 +306,10 @@ def test_a_residual_that_no_robot_can_play_is_no_graph(tmp_path: Path) -> None:
         json.dumps({**given, "settings": {**given["settings"], "privileged": ["load"]}})
     )
     with pytest.raises(ConfigurationError, match="a teacher, which sees the true load"):
-        ResidualLayout.of(f"residual:{tmp_path / 'r'}")
+        ResidualLayout.load(f"residual:{tmp_path / 'r'}")
     file.write_text(json.dumps({**given, "robot": "antigravity:fly"}))
     with pytest.raises(ConfigurationError, match="name its environment by --env"):
-        ResidualLayout.of(f"residual:{tmp_path / 'r'}")
+        ResidualLayout.load(f"residual:{tmp_path / 'r'}")
     assert "antigravity" not in sys.modules
 
 

@@ -8,9 +8,10 @@ import pytest
 from scipy import stats
 
 from elastic_env.core.signals import Array
-from tests.cells import METRIC, cell, family
+from tests.cells import METRIC, cell, family, over_seeds
 from train.evaluate import statistics
 from train.evaluate.changes import changes
+from train.evaluate.scores import over_cells, per_robot, score
 from train.evaluate.statistics import (
     CONFIDENCE,
     RESAMPLES,
@@ -23,10 +24,9 @@ from train.evaluate.statistics import (
     mean_of_robots,
     middle,
     middle_half,
-    over_seeds,
     worst_share,
 )
-from train.evaluate.table import EpisodeTable, over_cells, per_robot, score
+from train.evaluate.table import EpisodeTable
 from train.report.score_tables import scores_table
 
 BOOTSTRAP: dict[str, Any] = {

@@ -36,13 +36,14 @@ from train.evaluate.episodes import evaluate
 from train.evaluate.progress import read_progress
 from train.evaluate.rollout import make_vector_env
 from train.learn.constant_search import ConstantSearch
-from train.learn.mixed_env import MixedVectorEnv, threads_of_each
-from train.learn.run_training import _change as change_in_words
+from train.learn.mixed_env import MixedVectorEnv, thread_counts
+from train.learn.run_training import _change_text as change_in_words
 from train.learn.run_training import resume
 from train.learn.sb3_env import SB3VecEnv
+from train.learn.tensorboard_curves import RewardLogger
 from train.learn.train_config import TrainConfig, training_worlds
 from train.learn.trainer import play_scenarios
-from train.learn.training import Curves, Training
+from train.learn.training import Training
 from train.runs.folders import lock_run
 from train.workers.executors import Executors
 
@@ -174,7 +175,7 @@ def test_curves_say_how_much_better_than_the_base_a_policy_is(tmp_path: Path) ->
 def test_the_reward_per_decision_counts_whole_episodes(tmp_path: Path) -> None:
     """Catches a mean over the sums of episodes, which is the better the shorter they are."""
     model = SimpleNamespace(ep_info_buffer=[{"r": -100.0, "l": 10}, {"r": -20.0, "l": 5}])
-    curves = Curves(str(tmp_path), model, SB3VecEnv(wrapped()))
+    curves = RewardLogger(str(tmp_path), model, SB3VecEnv(wrapped()))
     curves.record("rollout/ep_rew_mean", -60.0)
     curves.dump(7)
     curves.close()
@@ -310,7 +311,7 @@ def test_a_damaged_checkpoint_is_named(tmp_path: Path) -> None:
             else:
                 damaged.write_bytes(damaged.read_bytes()[:size])
             with pytest.raises(
-                ElasticError, match=r"checkpoint is damaged or not whole .*; remove it"
+                ElasticError, match=r"checkpoint is damaged or incomplete .*; remove it"
             ):
                 Training(config, 1, folder)
 
@@ -468,7 +469,7 @@ def test_the_last_environments_share_what_cores_are_left(
 ) -> None:
     """Catches a core that waits while the last of five scenarios steps, and more threads than
     cores."""
-    assert threads_of_each(cores, environments) == threads
+    assert thread_counts(cores, environments) == threads
 
 
 @pytest.mark.slow
@@ -616,7 +617,7 @@ def test_walks_that_are_learned_from_have_other_lengths_than_those_of_evaluation
     assert evaluated.task.num_substeps == 4
     walk = {"step_period": 3, "num_steps": 4}
     with pytest.raises(
-        ConfigurationError, match=r"must not say what the reference does: num_steps"
+        ConfigurationError, match=r"must not repeat keys of the reference: num_steps"
     ):
         TrainConfig(reference=walk, training_options={"num_steps": 20})
 
@@ -713,7 +714,7 @@ def test_a_training_seed_that_another_program_trains_is_left_alone(
     """Catches two programs that write into one folder, where a lock of the whole run does not
     reach."""
     config = TrainConfig(**{**SMALL, **PPO, "seeds": [3]})
-    monkeypatch.setattr("train.learn.run_training._PATIENCE_S", 0.0)
+    monkeypatch.setattr("train.learn.run_training._LOCK_TIMEOUT_S", 0.0)
     monkeypatch.chdir(tmp_path)
     Path("c.yaml").write_text(yaml.safe_dump(config.model_dump(mode="json")))
     (tmp_path / "run" / "seed_3").mkdir(parents=True)

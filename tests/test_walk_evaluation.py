@@ -37,15 +37,16 @@ from train.evaluate.support_changes import (
     support_changes,
     tilt,
 )
-from train.figures.chart import intervals, sweep_chart
 from train.figures.colours import policy_colours
 from train.figures.comparison_figures import (
-    by_option,
-    by_reference,
     draw_signals,
     figure_name,
+    group_by_option,
+    group_by_reference,
 )
 from train.figures.plots import draw_chart
+from train.figures.score_charts import sweep_chart
+from train.figures.time_chart import intervals
 from train.learn.train_config import TrainConfig
 from train.report.summary import failure_notes, print_summary, write_summary
 from train.speed.contenders import RawWorlds, VectorLoop
@@ -195,7 +196,7 @@ def test_figures_of_the_support_changes_are_taken_at_the_changes_alone(model: Wa
         (change, np.zeros((2, 12))),
         (change + 1, true + 0.1),
     ):
-        changes.take(step, estimate, observation, truth)
+        changes.record(step, estimate, observation, truth)
     L = model.biped.leg.reach + model.biped.ankle_height
     for world in (0, 1):
         metrics = changes.metrics(world)
@@ -470,7 +471,7 @@ def test_sweeps_have_a_curve_per_policy_and_gaps_where_all_fell() -> None:
     ] + [{}]
     ends = [[("", 0.03)], [("fell", 9.0)], [("", 0.01), ("fell", 9.0)], [("", 0.002)]]
     played = [made_up(cell, *end) for cell, end in zip(cells, ends, strict=True)]
-    points = by_option(played)
+    points = group_by_option(played)
     chart = sweep_chart(points, [cells[0].environment.swept[0]], "", policy_colours(list(points)))
     failing_panel, panel = chart.panels
     input_curve, level = panel.curves
@@ -488,7 +489,7 @@ def test_sweeps_have_a_curve_per_policy_and_gaps_where_all_fell() -> None:
 def test_references_are_swept_by_their_step_period() -> None:
     """Catches a list of durations that has no place on the axis."""
     references = [3, [0.8, 0.6, 0.8], {"step_period": 24, "num_steps": 2}]
-    points = by_reference(
+    points = group_by_reference(
         [made_up(walk(reference=reference), ("", 0.01)) for reference in references]
     )
     chart = sweep_chart(points, [walk().environment.swept[0]], "", policy_colours(list(points)))

@@ -13,7 +13,8 @@ from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
 from tests.test_c_export import COMPILERS, RELEASED, compiled, require_no_library
 from train.commands.cli import main
-from train.export.c_walker import PlayedSteps, c_walker, play_observations, play_steps
+from train.export.c_walker import c_walker
+from train.export.walker_vectors import PlayedSteps, play_observations, play_steps
 
 TOLERANCE = 1e-12
 WALKER = "elastic_env/WalkInPlace-v0"

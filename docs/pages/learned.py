@@ -9,15 +9,9 @@ from pathlib import Path
 
 from docs.pages.cells import Rows, page_table
 from elastic_env.core.errors import ConfigurationError
-from train.evaluate.changes import (
-    BEST_ANALYTIC,
-    FEWEST_SEEDS,
-    percent,
-    percent_interval,
-    signed_off,
-)
 from train.evaluate.episodes import group_by
 from train.evaluate.statistics import Estimate
+from train.evaluate.terms import BEST_ANALYTIC, FEWEST_SEEDS, add_sign, percent, percent_interval
 
 _METRICS = {
     "pelvis_error_rms_rad": ("pelvis error", "mrad"),
@@ -271,7 +265,7 @@ def _over_base(row: Mapping[str, str], unit: str) -> tuple[str, str]:
     base = 1e3 * float(row["base_mean"])
     return (
         f"{base:.{2 if unit == 'mrad' and base < _SMALL else 1}f}",
-        signed_off(_without_breaks(percent_interval(Estimate(change, low, high))), verdict),
+        add_sign(_without_breaks(percent_interval(Estimate(change, low, high))), verdict),
     )
 
 

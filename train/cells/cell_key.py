@@ -14,7 +14,7 @@ from baselines.policies import is_saved
 from baselines.residual.residual_folder import DESCRIPTION, WEIGHTS, find_folder
 from elastic_env.core.files import digest_of, is_file, read_bounded
 from train.evaluate.conditions import Condition
-from train.evaluate.environments import files_of_robot
+from train.evaluate.robot_file import files_of_robot
 from train.workers.versions import physics
 
 _IRRELEVANT_FIELDS = {"policy": {"level", "track"}, "member": {"rival"}}

@@ -35,8 +35,8 @@ from train.evaluate.conditions import (
     cell_of,
 )
 from train.evaluate.episodes import Evaluation, group_by
+from train.evaluate.scores import over_cells
 from train.evaluate.statistics import Estimate
-from train.evaluate.table import over_cells
 from train.report.markdown import to_markdown
 from train.report.tables import Head, Row, Table
 from train.report.terminal import print_table

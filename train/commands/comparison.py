@@ -11,9 +11,9 @@ from elastic_env.core.errors import ConfigurationError, SystemFailedError, quote
 from train.cells.play import CellsFailedError, run_conditions
 from train.cells.store import CELLS, Store
 from train.commands.compare_config import CompareConfig
-from train.evaluate.changes import changes, merge_seeds
+from train.evaluate.changes import changes
 from train.evaluate.conditions import Condition
-from train.evaluate.episodes import Evaluation
+from train.evaluate.episodes import Evaluation, merge_seeds
 from train.evaluate.maps import heat_maps
 from train.evaluate.robots import robot_scores
 from train.evaluate.rollout import make_policy, single_world_envs

@@ -104,7 +104,7 @@ class Demo(Model):
                 comparison_figures.draw_static_errors(static, model, fig6),
                 comparison_figures.draw_picture("time", curves, motion, sine),
             ]
-            for walk in comparison_figures.cells_together(walks):
+            for walk in comparison_figures.group_cells(walks):
                 files += comparison_figures.draw_signals(walk, folder, self.figure_format)
             testbed_rows = _testbed_rows(result, static)
             files += [
@@ -150,7 +150,7 @@ def _add_cells(page: Page, evaluations: Cells) -> None:
     """Add the scores of some cells, and a chart for each motion and scenario."""
     columns = evaluations[0].condition.environment.columns
     page.add("table", summary.summary_table(evaluations, columns))
-    for cells in comparison_figures.cells_together(evaluations):
+    for cells in comparison_figures.group_cells(evaluations):
         policies = dict.fromkeys(cell.condition.policy.title for cell in cells)
         add_time_chart(page, cells, policy_colours(list(policies)), _MAX_POINTS)
 

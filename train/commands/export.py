@@ -132,7 +132,7 @@ class C(Output):
         from train.export.c_residual import c_residual
         from train.export.residual_layout import ResidualLayout
 
-        return c_residual(ResidualLayout.of(self.model, self.env), prefix)
+        return c_residual(ResidualLayout.load(self.model, self.env), prefix)
 
     def _walker(self, prefix: str) -> str:
         """Return the header of a walker's policy."""
@@ -196,7 +196,7 @@ class Onnx(Output):
         from train.export.onnx_residual import onnx_model, played_vector
         from train.export.residual_layout import ResidualLayout
 
-        layout = ResidualLayout.of(self.residual, self.env)
+        layout = ResidualLayout.load(self.residual, self.env)
         output = self.output or Path(f"{_short_name(self.residual)}.onnx")
         if output.suffix != ".onnx":
             raise ConfigurationError(f"a graph of ONNX is a file .onnx, got {shorten(output)}")

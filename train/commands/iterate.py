@@ -22,9 +22,9 @@ from elastic_env.world.robot_model import WalkerModel
 from train.commands.options import DEFAULT_SCENARIO, MotionOrDefault
 from train.evaluate.conditions import Condition, PolicySpec, Seed, cell_of
 from train.evaluate.rollout import make_policy, make_vector_env
-from train.evaluate.table import over_cells
+from train.evaluate.scores import over_cells
 from train.figures import plots
-from train.figures.chart import trials_chart
+from train.figures.score_charts import trials_chart
 from train.report.tables import number_interval
 from train.runs.console import make_table
 from train.runs.escaping import write_records

@@ -30,8 +30,8 @@ from train.commands.options import Motion, StiffnessOrFile
 from train.commands.play import play
 from train.commands.robot_at_rest import TABLE_STYLE, joint_shares, picture, shares_table
 from train.evaluate.conditions import Condition, PolicySpec, Seed
-from train.evaluate.environments import ENDINGS, read_robot_file
 from train.evaluate.episodes import Evaluation
+from train.evaluate.robot_file import ENDINGS, read_robot_file
 from train.figures import plots
 from train.report.write import require_libraries
 from train.runs.console import make_table, print_files

@@ -4,19 +4,17 @@ A residual is compared with its base and with the best policy without learning. 
 compared with the base of the residuals, or without residuals with the first policy.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import pandas as pd
 
 from elastic_env.core.signals import Array
-from elastic_env.world.scenario import make_scenario
-from train.evaluate.conditions import Condition
-from train.evaluate.environments import Column, Environment
+from train.evaluate.environments import Column
 from train.evaluate.episodes import Evaluation, group_by
-from train.evaluate.residual_seeds import Origin
+from train.evaluate.scores import EpisodesByRobot, by_episode, failures, means_of_cells, pair
 from train.evaluate.statistics import (
     Counts,
     Estimate,
@@ -25,48 +23,9 @@ from train.evaluate.statistics import (
     improvement,
     interquartile_mean,
 )
-from train.evaluate.table import (
-    ByRobot,
-    EpisodeTable,
-    Groups,
-    Scope,
-    by_episode,
-    failures,
-    means_of_cells,
-    pair,
-)
-
-CEILING = "ceiling on the training condition"
-SAME_ROBOT = "trained robot"
-"""Scenario in which nothing is random: training and evaluation see the same; one whose only robot
-is that of the training, so that evaluation differs by noise alone."""
-HELD_OUT = "held out"
-PARTLY = "partly held out"
-"""Scenario that training never saw; group of scenarios of which it saw some."""
-BEST_ANALYTIC = "best policy without learning"
-"""Title of the policy that a residual is compared with beside its base."""
-FEWEST_SEEDS = 5
-"""Training seeds, or robots and episodes of a policy without them, from which on an interval is
-taken for a verdict: of 95 % intervals over two seeds every other one misses the truth, over five
-every eleventh."""
-CLAIM_SEEDS = 10
-"""Training seeds that a claim needs; with fewer, intervals exclude zero too often without any
-effect.
-"""
-CLAIM_ROBOTS = 64
-"""Drawn robots that a claim about `drawn` needs: with 8 of them means differ by 15 %."""
-
-SIGNS = {"none": "*", "unclear": "?"}
-"""Signs behind a change that is not shown, by its verdict."""
-SIGNS_ARE = (
-    "A star: the interval includes zero. A question mark: too few training seeds, robots or"
-    " episodes to say."
-)
-
-_SMALL = 0.0995
-"""Below it a share is shown with a decimal."""
-_LEAST = 0.005
-"""Below it a bound would look like zero without one."""
+from train.evaluate.table import EpisodeTable, Groups, Scope
+from train.evaluate.terms import FEWEST_SEEDS, percent
+from train.evaluate.training_marks import training_marks
 
 Verdict = Literal["lower", "higher", "none", "unclear"]
 
@@ -77,20 +36,20 @@ class Change(Scope):
 
     Attributes:
         base: Title of the base.
-        marks: What the reader has to know of the row: a ceiling, something held out.
+        marks: Limits of what the row shows: a ceiling, or a condition that training never saw.
         column: The metric.
-        is_judged: Whether policies are judged by it; else it stands in tables alone.
-        per_seed: Relative change of every training seed, nan where it has no pair, (seeds,); of a
-            baseline one value.
-        relative: Interquartile mean of it over training seeds; its interval is over them and over
+        is_judged: True if policies are judged by the metric; otherwise it is only in tables.
+        per_seed: Relative change of every training seed, (seeds,); nan where it has no pair of
+            episodes. One value for a baseline.
+        relative: Interquartile mean of `per_seed`. Its interval is over training seeds, and over
             the robots of the cells that draw them.
         improvement: Probability that an episode is better than the base's.
-        mine, theirs: Metric of the policy and of its base over the pairs [SI]; the interquartile
-            mean over training seeds.
+        mine, theirs: Metric of the policy and of its base over the pairs [SI], interquartile mean
+            over training seeds.
         num_pairs: Pairs of training seed and episode.
-        falls, episodes: Failed episodes of the policy, of all of its episodes.
+        falls, episodes: Failed episodes of the policy, and all of its episodes.
         base_falls, base_episodes: The same of the base.
-        is_rival: Whether `base` is not the base of the residual but the best policy without
+        is_rival: True if `base` is not the base of the residual but the best policy without
             learning.
     """
 
@@ -117,15 +76,15 @@ class Change(Scope):
 
     @property
     def num_compared(self) -> int:
-        """Training seeds that have something to compare."""
+        """Training seeds that have a pair of episodes in every cell."""
         return int(np.isfinite(self.per_seed).sum())
 
     @property
     def verdict(self) -> Verdict:
         """lower, higher, none (the interval includes zero), or unclear.
 
-        That is with too few training seeds, or too few robots and episodes of a policy that was
-        not trained.
+        It is unclear with too few training seeds. For a policy without training it is unclear with
+        too few robots and episodes.
         """
         low = self.relative.low
         high = self.relative.high
@@ -143,13 +102,13 @@ class Change(Scope):
 
     @property
     def falls_less(self) -> bool:
-        """True if it fails in a smaller share."""
+        """True if the policy fails in a smaller share of its episodes than its base."""
         return self.falls * self.base_episodes < self.base_falls * self.episodes
 
     @property
     def sentence(self) -> str:
-        """The row in a sentence: what it shows, and what it does not."""
-        parts = [self._size]
+        """The row in a sentence: the change, and the limits of what it shows."""
+        parts = [self._change_text]
         missing = len(self.per_seed) - self.num_compared
         if self.is_family and 0 < missing < self.num_seeds:
             seeds = f"{missing} of {self.num_seeds} training seeds"
@@ -161,12 +120,12 @@ class Change(Scope):
         return "; ".join(parts)
 
     @property
-    def _size(self) -> str:
+    def _change_text(self) -> str:
         value = self.relative.value
         if not np.isfinite(value):
-            where = "in one of the scenarios " if self.is_group else ""
-            no = "there is no episode in which both stayed up to the end"
-            return f"nothing to compare: {where}{no}"
+            scope = "in one of the scenarios " if self.is_group else ""
+            problem = "there is no episode in which both stayed up to the end"
+            return f"nothing to compare: {scope}{problem}"
         size = f"{percent(abs(value), signed=False)} {'lower' if value < 0.0 else 'higher'}"
         if value == 0.0:
             size = "no change"
@@ -184,68 +143,22 @@ class Change(Scope):
         return f"{size} with {over}: too few to tell it from chance"
 
 
-def signed_off(text: str, verdict: str) -> str:
-    """A change with the sign of its verdict behind it, if it has one."""
-    return f"{text} {SIGNS[verdict]}" if verdict in SIGNS else text
-
-
-def percent(value: float, signed: bool = True) -> str:
-    """A share in per cent, with a decimal where it is small; - where there is none."""
-    if not np.isfinite(value):
-        return "-"
-    return f"{_hundredths(value, signed, 0.0 < abs(value) < _SMALL)} %"
-
-
-def percent_interval(estimate: Estimate, signed: bool = True) -> str:
-    """A share with its interval, such as −40 % [−45, −33]."""
-    if not estimate.has_interval:
-        return percent(estimate.value, signed)
-    shares = (estimate.value, *estimate.ends)
-    sizes = [abs(share) for share in shares]
-    is_fine = 0.0 < max(sizes) < _SMALL or any(0.0 < size < _LEAST for size in sizes)
-    value, low, high = (_hundredths(share, signed, is_fine) for share in shares)
-    return f"{value} % [{low}, {high}]"
-
-
-def _hundredths(share: float, signed: bool, is_fine: bool) -> str:
-    return f"{100.0 * share:{'+' if signed else ''}.{int(is_fine)}f}".replace("-", "−")
-
-
-def signed_interval(estimate: Estimate, verdict: str) -> str:
-    """A share with its interval and the sign of its verdict, such as +1 % [−2, +4] *."""
-    text = percent_interval(estimate)
-    return signed_off(text, verdict) if np.isfinite(estimate.value) else text
-
-
-def merge_seeds(evaluations: Sequence[Evaluation]) -> list[Evaluation]:
-    """Cells with all training seeds of a family in one: all episodes, the trace of the first."""
-    together: dict[tuple[object, ...], Evaluation] = {}
-    for number, e in enumerate(evaluations):
-        c = e.condition
-        key = (number,) if c.member is None else (c.policy.title, *c.cell)
-        if key in together:
-            together[key].episodes.extend(e.episodes)
-        else:
-            together[key] = replace(e, episodes=list(e.episodes))
-    return list(together.values())
-
-
 def opponents(table: EpisodeTable) -> dict[str, list[str]]:
     """Titles of the policies that each policy is compared with.
 
     A residual has a base and a rival. A baseline has the bases of the residuals, or the first
     policy.
     """
-    found = {}
     families = table.members.values()
-    bases = dict.fromkeys(member.base for own in families for member in own.values())
+    bases = dict.fromkeys(member.base for family in families for member in family.values())
+    result = {}
     for title in table.policies:
-        others: Iterable[str | None] = bases or table.policies[:1]
+        others: Sequence[str | None] = list(bases) or table.policies[:1]
         if title in table.members:
             member = next(reversed(table.members[title].values()))
             others = (member.base, member.rival)
-        found[title] = [other for other in others if other not in (title, None)]
-    return found
+        result[title] = [other for other in others if other not in (title, None)]
+    return result
 
 
 def changes(evaluations: Sequence[Evaluation], groups: Groups | None = None) -> list[Change]:
@@ -256,7 +169,7 @@ def changes(evaluations: Sequence[Evaluation], groups: Groups | None = None) -> 
         groups: Scenarios to pool over, by name.
     """
     table = EpisodeTable(evaluations)
-    known = table.environment
+    environment = table.environment
     return [
         change_of(table, scope, base, column)
         for title, others in opponents(table).items()
@@ -264,7 +177,7 @@ def changes(evaluations: Sequence[Evaluation], groups: Groups | None = None) -> 
         if base in table.policies
         for scope in table.scopes(title, groups or {})
         if len(table.cells_of_base(scope, base)) == len(scope.cells)
-        for column in (*known.judged, *known.also)
+        for column in (*environment.judged, *environment.also)
     ]
 
 
@@ -273,52 +186,53 @@ def change_of(table: EpisodeTable, scope: Scope, base: str, column: Column) -> C
 
     Args:
         table: All episodes.
-        scope: Policy and cells; over several the means are pooled.
+        scope: Policy and cells; over several cells the means are pooled.
         base: Title of the other policy, which plays in all of these cells.
         column: The metric.
 
     Raises:
-        ValueError: A seed occurs twice, so that nobody can say which episode belongs to which.
+        ValueError: A seed occurs twice, so that episodes cannot be paired.
     """
-    own = table.of(scope.policy, *scope.cells)
-    drawn = [own.loc[own["cell"] == cell, "robot"].iloc[0] != "" for cell in scope.cells]
-    if scope.first.member is None:
-        own = by_episode(own)
-    cells = table.cells_of_base(scope, base)
-    beside = zip(cells, scope.cells, strict=True)
-    parts = [table.of(base, there).assign(cell=cell) for there, cell in beside]
-    theirs = pd.concat(parts)
-    both = pair(own, theirs, column.metric)
-    robot_by_robot = ByRobot(both)
-    mine = robot_by_robot.figures("mine")
-    base_values = robot_by_robot.figures("base")
-    robots = [values.shape[1] for values in mine]
+    own_rows = table.rows_of(scope.policy, *scope.cells)
+    draws_robots = [
+        own_rows.loc[own_rows["cell"] == cell, "robot"].iloc[0] != "" for cell in scope.cells
+    ]
+    member = scope.first.member
+    if member is None:
+        own_rows = by_episode(own_rows)
+    cell_pairs = zip(table.cells_of_base(scope, base), scope.cells, strict=True)
+    base_rows = pd.concat(
+        [table.rows_of(base, base_cell).assign(cell=cell) for base_cell, cell in cell_pairs]
+    )
+    pairs = EpisodesByRobot(pair(own_rows, base_rows, column.metric))
+    own_values = pairs.figures("mine")
+    base_values = pairs.figures("base")
+    robots = [values.shape[1] for values in own_values]
     once = [np.ones((1, number)) for number in robots]
-    means = means_of_cells(mine, once)[:, 0].T
+    own_means = means_of_cells(own_values, once)[:, 0].T
     base_means = means_of_cells(base_values, once)[:, 0].T
 
     def relative(counts: Counts) -> Array:
-        sides = (means_of_cells(values, counts).T for values in (mine, base_values))
+        sides = (means_of_cells(values, counts).T for values in (own_values, base_values))
         return change(*sides).T
 
     won, played = (
-        [np.nan_to_num(values) for values in robot_by_robot.figures("won", statistic)]
+        [np.nan_to_num(values) for values in pairs.figures("won", statistic)]
         for statistic in ("sum", "count")
     )
-    falls, episodes = failures(own)
-    base_falls, base_episodes = failures(theirs)
-    member = scope.first.member
+    falls, episodes = failures(own_rows)
+    base_falls, base_episodes = failures(base_rows)
     return Change(
         **vars(scope),
         base=base,
-        marks=_marks(table.families.get(scope.policy), scope.conditions),
+        marks=training_marks(table.families.get(scope.policy), scope.conditions),
         column=column,
         is_judged=column in table.environment.judged,
-        per_seed=change(means, base_means),
-        relative=of_units(estimate(relative, robots), robots, drawn),
-        improvement=of_units(improvement(won, played), robots, drawn),
-        mine=_mean(means),
-        theirs=_mean(base_means),
+        per_seed=change(own_means, base_means),
+        relative=count_episodes_apart(estimate(relative, robots), robots, draws_robots),
+        improvement=count_episodes_apart(improvement(won, played), robots, draws_robots),
+        mine=_mean_over_seeds(own_means),
+        theirs=_mean_over_seeds(base_means),
         num_pairs=int(sum(values.sum() for values in played)),
         falls=falls,
         episodes=episodes,
@@ -328,74 +242,29 @@ def change_of(table: EpisodeTable, scope: Scope, base: str, column: Column) -> C
     )
 
 
-def of_units(found: Estimate, units: Sequence[int], drawn: Sequence[bool]) -> Estimate:
-    """An estimate that tells drawn robots from episodes of one robot, of units in all cells."""
-    if not found.robots:
-        return found
-    robots = sum(n for n, is_drawn in zip(units, drawn, strict=True) if is_drawn and n > 1)
-    return replace(found, robots=robots, episodes=found.robots - robots)
+def count_episodes_apart(
+    total: Estimate, units: Sequence[int], draws_robots: Sequence[bool]
+) -> Estimate:
+    """Return an estimate that counts drawn robots and episodes of one robot apart.
+
+    Args:
+        total: Estimate that counts all of these units as robots.
+        units: Robots or episodes of every cell.
+        draws_robots: True for every cell whose units are robots.
+    """
+    if not total.robots:
+        return total
+    robots = sum(n for n, is_drawn in zip(units, draws_robots, strict=True) if is_drawn and n > 1)
+    return replace(total, robots=robots, episodes=total.robots - robots)
 
 
-def _mean(values: Array) -> float:
-    """Interquartile mean over training seeds of means over scenarios and episodes."""
+def _mean_over_seeds(values: Array) -> float:
+    """Interquartile mean over training seeds of means over scenarios, (seeds, scenarios)."""
     means = np.mean(values, axis=-1)
     means = means[np.isfinite(means)]
     return float(interquartile_mean(means)) if len(means) else float("nan")
 
 
-def _marks(trained: Origin | None, conditions: Sequence[Condition]) -> tuple[str, ...]:
-    """Marks of a row: how far training has seen its conditions."""
-    if trained is None:
-        return ()
-    if trained.scenarios is None:
-        return ("training condition unknown",)
-    known = conditions[0].environment
-    motion: Any = trained.reference
-    if motion is None:
-        motion = known.default_reference
-    seen = _motion(known, motion) == _motion(known, conditions[0].reference)
-    quantity = known.quantity or "reference"
-    scenarios = [_seen_as(condition, trained) for condition in conditions]
-    unseen = [scenario for scenario in scenarios if scenario not in trained.scenarios]
-    if unseen:
-        if len(unseen) == len(scenarios):
-            return (HELD_OUT if seen else f"{HELD_OUT} scenario and {quantity}",)
-        named = f": {', '.join(unseen)}"
-        return (f"{PARTLY}{named}" if seen else f"{HELD_OUT}{named} and {quantity}",)
-    if not seen:
-        return (f"{HELD_OUT} {quantity}",)
-    if conditions[0].swept:
-        return ()
-    if any(known.is_deterministic(scenario, motion) for scenario in scenarios):
-        return (CEILING,)
-    same = [s for s in scenarios if known.differs_by_noise_alone(s, motion)]
-    named = f": {', '.join(same)}" if len(same) < len(scenarios) else ""
-    return (f"{SAME_ROBOT}{named}",) if same else ()
-
-
-def _seen_as(condition: Condition, trained: Origin) -> str:
-    """The scenario of a condition, by the name under which training has seen the same."""
-    played = condition.scenario_played
-    seen = trained.scenarios or ()
-    if isinstance(played, str) and not trained.ranges:
-        return played
-    walks = condition.environment.walks
-    played = make_scenario(played, walks).replace(name="")
-    for name in seen:
-        if make_scenario(name, walks, trained.ranges).replace(name="") == played:
-            return name
-    if condition.swept:
-        return f"varied {condition.scenario}"
-    is_other = condition.scenario in seen
-    return f"{condition.scenario} of other ranges" if is_other else condition.scenario
-
-
-def _motion(known: Environment, reference: Any) -> str:
-    """The part of a reference that training may have seen: its kind, or its step period alone."""
-    return known.label(known.arguments(reference)[known.motion])
-
-
-def by_line(rows: Sequence[Change]) -> list[list[Change]]:
-    """Changes of the same policy, base and cell together, one per metric."""
-    lines = group_by(rows, lambda row: (row.policy, row.base, row.place))
-    return list(lines.values())
+def group_lines(rows: Sequence[Change]) -> list[list[Change]]:
+    """Return the lines of a table: changes of one policy, base and cell, one per metric."""
+    return list(group_by(rows, lambda row: (row.policy, row.base, row.place)).values())

@@ -1,4 +1,4 @@
-"""Cells of a comparison: which policy plays which motion in which environment."""
+"""Cells of a comparison: a policy, a motion and an environment with its scenario."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from functools import lru_cache
@@ -24,26 +24,26 @@ from train.evaluate.environments import (
 
 MOST_EPISODES = 100_000
 NumEpisodes = Annotated[int, quantity("1", ge=1, le=MOST_EPISODES)]
+"""Episodes of a cell."""
 Seed = Annotated[int, quantity("1", ge=0, le=LARGEST_SEED - MOST_EPISODES)]
 """Seed of the first episode; others follow."""
-"""Episodes of a cell."""
 SCENARIO = "scenario."
 """Prefix of a field of the scenario that is varied, such as scenario.stiffness."""
 HALF_WIDTH = "half_width"
-"""Part of such a name: half the width of an interval about 0 is varied."""
+"""Ending of such a name: half the width of an interval about 0 is varied."""
 
 
-def _options(value: dict[str, Any]) -> dict[str, Any]:
-    motions = {known.motion for known in ENVIRONMENTS.values()}
+def _check_options(value: dict[str, Any]) -> dict[str, Any]:
+    motions = {environment.motion for environment in ENVIRONMENTS.values()}
     _refuse(value.keys() & {*RESERVED, *motions}, "given here")
     return value
 
 
-EnvOptions = Annotated[dict[str, Any], AfterValidator(_options)]
-"""Further arguments of an environment, none of which has a place of its own."""
+EnvOptions = Annotated[dict[str, Any], AfterValidator(_check_options)]
+"""Further arguments of an environment, without those that have a key of their own."""
 
 
-def _reference(value: Any) -> Reference:
+def _check_reference(value: Any) -> Reference:
     kinds = str | int | float | list | tuple | dict
     if isinstance(value, bool) or not isinstance(value, kinds):
         raise ValueError(
@@ -55,37 +55,39 @@ def _reference(value: Any) -> Reference:
     return list(value) if isinstance(value, tuple) else value
 
 
-def _refuse(taken: set[str], what: str) -> None:
-    """Refuse arguments of the environments that stand in the wrong place."""
-    for name in sorted(taken):
-        place = "it has a key, or an option, of its own"
+def _refuse(names: set[str], place: str) -> None:
+    """Refuse arguments of the environments in a place where they do not belong."""
+    for name in sorted(names):
+        cure = "it has a key, or an option, of its own"
         if name in UNPLACED:
-            place = "the commands set it themselves"
-        raise ValueError(f"{name} cannot be {what}; {place}")
+            cure = "the commands set it themselves"
+        raise ValueError(f"{name} cannot be {place}; {cure}")
 
 
-GivenReference = Annotated[Any, AfterValidator(_reference)]
+GivenReference = Annotated[Any, AfterValidator(_check_reference)]
 """A `Reference`, checked when it is read."""
 
 
-def _ranges(value: Any) -> Any:
+def _check_ranges(value: Any) -> Any:
     make_scenario("drawn", ranges=value)
     return value
 
 
 GivenRanges = Annotated[
     dict[str, Any] | Annotated[list[dict[str, Any]], Field(max_length=MOST_RANGES)],
-    AfterValidator(_ranges),
+    AfterValidator(_check_ranges),
 ]
-"""Intervals of drawn robots that differ from those of their scenario, by the names of
-`RobotRanges`; or several such mappings, each of an equal share of the robots."""
+"""Intervals of drawn robots that replace those of their scenario, by the names of `RobotRanges`.
+
+Or a list of such mappings, each for an equal share of the robots.
+"""
 
 
 def require_drawn(scenarios: Sequence[str], ranges: GivenRanges) -> None:
     """Refuse ranges that no scenario uses.
 
     Raises:
-        ConfigurationError: There are ranges, and no scenario is `drawn` or joined with it.
+        ConfigurationError: There are ranges, and no scenario is `drawn` or combined with it.
     """
     if ranges and not any("drawn" in name.split("+") for name in scenarios):
         raise ConfigurationError(
@@ -95,26 +97,26 @@ def require_drawn(scenarios: Sequence[str], ranges: GivenRanges) -> None:
 
 
 class PolicySpec(Model):
-    """A policy of a comparison: a baseline, or "FILE.py:function" for one's own, with options."""
+    """A policy of a comparison with options: a baseline, or your own as "FILE.py:function"."""
 
     name: Locator
     """A baseline, residual:PATH, iterative:PATH, FILE.py:function or module:function."""
     label: Locator | None = None
-    """How tables and figures call it; None for its name."""
+    """Name in tables and figures; None for its name."""
     options: dict[str, Any] = {}
-    """Keyword arguments of `baselines.make`, or of one's own function."""
+    """Keyword arguments of `baselines.make`, or of your own function."""
     env_options: EnvOptions = {}
     """Arguments of the environment for this policy alone, such as form: rigid."""
     level: bool = False
-    """In a sweep: whether it plays once without the swept option, as a level to compare with."""
+    """In a sweep: true to play once without the swept option, as a level to compare with."""
     track: Track | None = None
-    """On a leaderboard: what it needs; None for what is known of it, and of one's own policy the
+    """On a leaderboard: its needs; None for those of its name, and for your own policy the
     standard sensors.
     """
 
     @property
     def title(self) -> str:
-        """Label, or name."""
+        """The label, or the name without one."""
         return self.label or self.name
 
 
@@ -124,35 +126,35 @@ class Member(Model):
     folder: str
     """Folder of the residual."""
     training_seed: int | None = None
-    """Seed that it was trained with; None where nothing says it."""
+    """Seed that it was trained with; None if neither its files nor its path name one."""
     base: str
     """Title of the policy that it corrects."""
     rival: str | None = None
-    """Title of the best policy without learning and with the standard sensors; None where that is
-    the base, or nobody plays it."""
+    """Title of the best policy without learning and with the standard sensors; None if that is
+    the base, or does not play."""
 
 
 class Condition(Model):
-    """One cell of a comparison: who plays what under which scenario."""
+    """One cell of a comparison: a policy plays a motion in a scenario."""
 
     env: str = "testbed"
     policy: PolicySpec
     member: Member | None = None
-    """Of a residual: which training seed the policy is, and what it corrects."""
+    """Training seed and base of a residual; None for another policy."""
     reference: GivenReference = None
-    """The motion: on the testbed a name or a mapping with `kind`, on the walker a step period [s],
-    three durations [s], or a mapping with `step_period` and further arguments of the environment;
-    None for the environment's default."""
+    """The motion; None for the environment's default. On the testbed: a name or a mapping with
+    `kind`. On the walker: a step period [s], three durations [s], or a mapping with `step_period`
+    and further arguments of the environment."""
     label: str | None = None
-    """How tables and figures call the reference; None for what the environment calls it."""
+    """Name of the reference in tables and figures; None for the environment's name."""
     scenario: Title = "nominal"
     env_options: EnvOptions = {}
     """Further arguments of the environment, such as stiffness."""
     ranges: GivenRanges = {}
-    """Intervals in place of those of the scenario, where it draws robots from ranges."""
+    """Intervals that replace those of the scenario, if it draws robots from ranges."""
     swept: dict[str, float] = {}
-    """The varied quantity and its value: an option of the policy, or with `SCENARIO` before it
-    one of the scenario.
+    """Varied quantities and their values: options of the policy, or with the prefix `SCENARIO`
+    fields of the scenario.
     """
     episodes: NumEpisodes = 1
     """Number of episodes [1]."""
@@ -160,7 +162,7 @@ class Condition(Model):
     """Seed of the first episode; the next ones follow [1]."""
 
     def swept_values(self, names: Iterable[str]) -> list[str]:
-        """Varied values as tables show them; - of what does not vary here."""
+        """Varied values as tables show them; - for a quantity that does not vary here."""
         return [f"{self.swept[n]:g}" if n in self.swept else "-" for n in names]
 
     @model_validator(mode="before")
@@ -168,18 +170,18 @@ class Condition(Model):
     def _environment_has_a_default(cls, values: dict[str, Any]) -> dict[str, Any]:
         is_named = isinstance(values, dict) and isinstance(values.get("env", ""), str)
         if is_named and values.get("reference") is None:
-            known = environment(values.get("env", "testbed"))
-            values = {**values, "reference": known.default_reference}
+            default = environment(values.get("env", "testbed")).default_reference
+            values = {**values, "reference": default}
         return values
 
     @property
     def environment(self) -> Environment:
-        """The environment, as the commands know it."""
+        """Description of the environment."""
         return environment(self.env)
 
     @property
     def reference_name(self) -> str:
-        """Label of the reference, or what the environment calls it."""
+        """Label of the reference, or the environment's name of it."""
         return self.label or self.environment.label(self.reference)
 
     @property
@@ -189,7 +191,7 @@ class Condition(Model):
 
     @property
     def number(self) -> float | None:
-        """Number of the reference that scores can be drawn against [s]; None without one."""
+        """Number of the reference for the axis of a chart [s]; None without one."""
         return next(iter(self.environment.abscissa(self.reference).values()), None)
 
     @property
@@ -200,19 +202,18 @@ class Condition(Model):
         """
         motion = self.environment.arguments(self.reference)
         options = {**self.env_options, **self.policy.env_options, **motion}
-        found = {"scenario": self.scenario_played, **options}
-        given = found.get("sensors", [])
+        arguments = {"scenario": self.scenario_played, **options}
+        sensors = arguments.get("sensors", [])
         needed = sensors_needed(self.policy.name, self.environment.walks)
-        # else the environment says what they are
-        if needed and isinstance(given, list | tuple):
-            found["sensors"] = [*given, *(name for name in needed if name not in given)]
-        return found
+        # the environment refuses sensors of another type
+        if needed and isinstance(sensors, list | tuple):
+            arguments["sensors"] = [*sensors, *(name for name in needed if name not in sensors)]
+        return arguments
 
     @property
     def scenario_played(self) -> str | Scenario:
-        """The scenario with its own ranges and varied fields; its name where it has neither."""
-        swept = self.swept.items()
-        fields = {name: v for name, v in swept if name.startswith(SCENARIO)}
+        """The scenario with its own ranges and varied fields; its name if it has neither."""
+        fields = {name: v for name, v in self.swept.items() if name.startswith(SCENARIO)}
         if not fields and not self.ranges:
             return self.scenario
         scenario = make_scenario(self.scenario, self.environment.walks, self.ranges)
@@ -220,18 +221,16 @@ class Condition(Model):
 
     @property
     def draws_robots(self) -> bool:
-        """True if episodes differ in their robots; on hardware there is one."""
-        known = self.environment
-        if known.is_real:
+        """True if episodes differ in their robots; hardware has one robot."""
+        if self.environment.is_real:
             return False
-        return make_scenario(self.scenario_played, known.walks).draws_robots
+        return make_scenario(self.scenario_played, self.environment.walks).draws_robots
 
     @property
     def policy_options(self) -> dict[str, Any]:
-        """Options of the policy with the swept one."""
-        swept = self.swept.items()
-        own = {name: v for name, v in swept if not name.startswith(SCENARIO)}
-        return {**self.policy.options, **own}
+        """Options of the policy, with those that are swept."""
+        swept = {name: v for name, v in self.swept.items() if not name.startswith(SCENARIO)}
+        return {**self.policy.options, **swept}
 
     @property
     def track(self) -> Track:
@@ -240,15 +239,15 @@ class Condition(Model):
 
 
 def cell_of(options: Any, policy: PolicySpec) -> Condition:
-    """The cell of a policy that options name by their env, scenario, reference and seed."""
+    """The cell of a policy, with env, scenario, reference and seed of a command's options."""
     names = ("env", "scenario", "reference", "seed")
     return Condition(policy=policy, **{name: getattr(options, name) for name in names})
 
 
 def vary_scenario(scenario: Scenario, fields: Mapping[str, float]) -> Scenario:
-    """A scenario with other values of some fields, such as `scenario.stiffness` [SI].
+    """Return a scenario with other values of some fields, such as `scenario.stiffness` [SI].
 
-    Of `scenario.mounting_rad.half_width` the value is half the width of an interval about 0.
+    The value of `scenario.mounting_rad.half_width` is half the width of an interval about 0.
 
     Raises:
         ConfigurationError: A value is beyond the bounds of its field, or robots differ in it.
@@ -274,20 +273,20 @@ def vary_scenario(scenario: Scenario, fields: Mapping[str, float]) -> Scenario:
 @lru_cache(maxsize=1)
 def scenario_fields() -> Mapping[str, tuple[str, str]]:
     """Numbers of a scenario that can be varied: description and unit by name."""
-    return _numbers_of(Scenario, SCENARIO)
+    return _number_fields(Scenario, SCENARIO)
 
 
-def _numbers_of(model: type[Model], before: str) -> dict[str, tuple[str, str]]:
-    found: dict[str, tuple[str, str]] = {}
+def _number_fields(model: type[Model], prefix: str) -> dict[str, tuple[str, str]]:
+    fields: dict[str, tuple[str, str]] = {}
     for name, field in model.model_fields.items():
         extra = field.json_schema_extra
         if isinstance(field.annotation, type) and issubclass(field.annotation, Model):
-            found |= _numbers_of(field.annotation, f"{before}{name}.")
+            fields |= _number_fields(field.annotation, f"{prefix}{name}.")
         elif isinstance(extra, dict):
             meaning = meaning_of(field) or name
             unit = str(extra["unit"])
-            found[f"{before}{name}"] = meaning, unit
+            fields[f"{prefix}{name}"] = meaning, unit
             bounds: Any = extra.get("bounds", (0.0, 1.0))
             if bounds[0] == -bounds[1]:
-                found[f"{before}{name}.{HALF_WIDTH}"] = f"half-width: {meaning}", unit
-    return found
+                fields[f"{prefix}{name}.{HALF_WIDTH}"] = f"half-width: {meaning}", unit
+    return fields

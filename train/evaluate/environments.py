@@ -1,104 +1,41 @@
 """The environments as the commands know them: their arguments, figures and tables."""
 
 import tomllib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
+from itertools import chain
 from pathlib import Path
 from typing import Any, TypeAlias
 
 from pydantic import ConfigDict, ImportString, TypeAdapter
 
 from elastic_env import IDS
-from elastic_env.core.config import Locator, Model, load_yaml, quantity
 from elastic_env.core.errors import ConfigurationError, quote, unknown_name
 from elastic_env.motion.gait import Gait
 from elastic_env.robots.joint_robot import JointRobot
 from elastic_env.world.scenario import make_scenario
+from train.evaluate.robot_file import ENDINGS, read_robot_file
 from train.runs.user_code import named_object
 
-ENDINGS = (".yaml", ".yml")
-"""Of files of robots."""
-
-
-class RobotFile(Model):
-    """A robot on a fixed base; keys as of `gymnasium.make("elastic_env/Robot-v0", ...)`."""
-
-    model: Locator
-    """Rigid model, a file of MJCF (.xml) or URDF (.urdf)."""
-    joints: Locator | dict[str, Any]
-    """Elastic joints: a YAML file, or a mapping from names or patterns."""
-    end_effector: Locator | None = None
-    """Site or body whose place and tilt are scored; None for the outermost body."""
-    home: dict[str, float] | list[float] | None = None
-    """Angles about which the joints follow a reference, by name or in order [rad]."""
-    load_kg: float | None = quantity("kg", None, gt=0)
-    """The scenario `payload` adds a fifth of it at the end effector [kg]."""
-    imu: Locator | None = None
-    """Site of the accelerometer."""
-
-    def arguments(self, folder: Path) -> dict[str, Any]:
-        """Arguments of the environment; files are those of a folder."""
-        given = self.model_dump(exclude_none=True)
-        files = {name: str(folder / path) for name, path in _files(given)}
-        return {**given, **files}
-
-
-def read_robot_file(name: str) -> dict[str, Any]:
-    """Arguments of `elastic_env/Robot-v0` from a file, which `--env arm.robot.yaml` names.
-
-        model: arm.xml
-        joints: arm.yaml
-        end_effector: tool
-
-    Files that it names are looked for beside it.
-
-    Raises:
-        ConfigurationError: The file is missing or does not describe a robot.
-    """
-    try:
-        return load_yaml(name, RobotFile).arguments(Path(name).parent)
-    except ConfigurationError as error:
-        raise ConfigurationError(
-            f"--env {quote(name)[1:-1]} must be a file of a robot, with the keys model and joints:"
-            f" {error}"
-        ) from None
-
-
-def files_of_robot(name: str) -> Iterator[Path]:
-    """The files that a robot's file names, if it is one."""
-    if name.endswith(ENDINGS) and Path(name).is_file():
-        try:
-            arguments = read_robot_file(name)
-        except ConfigurationError:
-            return  # another file
-        yield from (Path(path) for _, path in _files(arguments))
-
-
-def _files(arguments: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Arguments that name a file."""
-    given = [(name, arguments[name]) for name in ("model", "joints")]
-    return [(name, value) for name, value in given if isinstance(value, str)]
-
-
 Reference: TypeAlias = str | int | float | list[float] | dict[str, Any]
-"""The motion: a name, a number, durations, or a mapping of parameters; each environment says
-which of them it takes.
+"""The motion: a name, a number, durations, or a mapping of parameters.
+
+Each environment accepts some of these forms.
 """
 
 UNPLACED = (
     *("num_envs", "num_threads", "autoreset_mode", "render_mode", "backend", "device"),
     *("id", "vectorization_mode", "vector_kwargs", "wrappers", "self"),
 )
-"""Arguments of the environments, and of the functions that make them, that have no place in a
-comparison.
-"""
+"""Arguments of environments, and of the functions that make them, that the commands set."""
 RESERVED = ("scenario", *UNPLACED)
-"""These, and the argument that has a key of its own."""
+"""Arguments that `env_options` must not contain: these, and the one with a key of its own."""
 
 _STRICT = ConfigDict(extra="forbid")
-"""A name in `environments.toml` that nobody knows is a mistake."""
+"""An unknown name in `environments.toml` is an error."""
 _UNITS = {"_rad": ("mrad", 1e3), "_m": ("mm", 1e3), "_s": ("ms", 1e3)}
+"""Shown unit of a metric and its factor from SI, by the ending of the metric's name."""
 
 
 @dataclass(frozen=True)
@@ -106,11 +43,11 @@ class Column:
     """A metric in tables and charts.
 
     Attributes:
-        title: Words for it, short.
+        title: Short words for it.
         metric: Name in the record of an episode; its end is the unit.
-        on_console: Whether it is shown where there is little room.
-        decimals: How many are shown.
-        note: What the title leaves open, for the legend; empty where it says it all.
+        on_console: True if it is also shown on the console, where there is little room.
+        decimals: Number of decimals that are shown.
+        note: Explanation of the title for the legend; empty if it needs none.
     """
 
     __pydantic_config__ = _STRICT
@@ -123,12 +60,12 @@ class Column:
     @property
     def unit(self) -> str:
         """Unit in which it is shown."""
-        return self._shown[0]
+        return self._unit_and_scale[0]
 
     @property
     def scale(self) -> float:
         """Factor from SI to the shown unit."""
-        return self._shown[1]
+        return self._unit_and_scale[1]
 
     @property
     def label(self) -> str:
@@ -136,7 +73,7 @@ class Column:
         return f"{self.title} [{self.unit}]"
 
     @property
-    def _shown(self) -> tuple[str, float]:
+    def _unit_and_scale(self) -> tuple[str, float]:
         return _UNITS[self.metric[self.metric.rindex("_") :]]
 
 
@@ -148,8 +85,8 @@ class TracedSignal:
         title: Words for it.
         name: Its name in the trace.
         unit: Unit in which it is shown.
-        reference: Name of what it should be in the trace; None where that is zero.
-        picture: Name of the picture that shows it; empty where it stands on the page alone.
+        reference: Name of its reference in the trace; None if the reference is zero.
+        picture: Name of the picture that shows it; empty if only the page shows it.
     """
 
     __pydantic_config__ = _STRICT
@@ -177,32 +114,31 @@ class Environment:
     Attributes:
         id: Its name for `gymnasium.make`.
         robot: Name of its task, under which trained policies are kept.
-        motion: Argument of `gymnasium.make` that says which motion is played; what a configuration
-            calls its reference.
-        default_reference: Reference where none is named.
-        watched_reference: The same for a picture; None for the default.
-        looped_policy: Policy in the loop of which the speed is measured, the best that needs no
-            truth.
-        live_policy: Policy that is timed against the clock; None for the looped one.
-        on_hardware: Short name of the same robot on hardware; empty where there is none.
-        make_reference: The motion of a reference; None where it is never random.
-        given: Further arguments of `gymnasium.make`.
+        motion: Argument of `gymnasium.make` for the motion, which a configuration calls its
+            reference.
+        default_reference: Reference if none is named.
+        watched_reference: Reference of a film or picture; None for the default.
+        looped_policy: Policy whose loop is timed for the speed, the best that needs no truth.
+        live_policy: Policy that is timed against the clock; None for `looped_policy`.
+        on_hardware: Short name of the same robot on hardware; empty if there is none.
+        make_reference: Makes the motion of a reference; None if motions are never random.
+        further_arguments: Further arguments of `gymnasium.make`.
         traced: Signals of the first episode that are kept.
-        columns: The summary table.
+        columns: Columns of the summary table.
         splits: Further tables of the summary: columns by title.
-        subject: What the summary table is about.
-        note: What its reader has to know beside the legend of the columns.
-        swept: Columns drawn against a swept value; the first is that of the bar chart.
-        learned_from: Further arguments of worlds that are learned from, which keep them apart from
-            those of evaluation.
+        subject: Subject of the summary table.
+        note: A note below the summary table, apart from the legend of the columns.
+        swept: Columns drawn against a swept value; the bar chart shows the first.
+        training_arguments: Further arguments of training worlds, so that they differ from the
+            worlds of evaluation.
         judged: Columns that policies are compared by, pair by pair.
-        also: Columns whose paired changes stand in the tables too.
+        also: Columns whose paired changes are in the tables too.
         curves: Signals over time in the report and in pictures.
-        quantity: What a reference is, in titles; empty where its label says it.
+        quantity: Name of the references' quantity in titles; empty if labels need none.
         failure: Heading for episodes that end before their time.
-        is_real: Whether it is hardware: one world at a time, in this process, without a truth to
-            score by.
-        walks: Whether its policies are those of the walker.
+        is_real: True for hardware: one world at a time, in this process, without a truth for
+            scores.
+        walks: True if its policies are those of the walker.
     """
 
     __pydantic_config__ = _STRICT
@@ -218,7 +154,7 @@ class Environment:
     curves: tuple[TracedSignal, ...]
     also: tuple[Column, ...] = ()
     splits: dict[str, tuple[Column, ...]] = field(default_factory=dict)
-    learned_from: dict[str, Any] = field(default_factory=dict)
+    training_arguments: dict[str, Any] = field(default_factory=dict)
     note: str = ""
     quantity: str = ""
     failure: str = "fail"
@@ -229,69 +165,74 @@ class Environment:
     live_policy: str | None = None
     on_hardware: str = ""
     make_reference: ImportString[Callable[[Any], Any]] | None = None
-    given: dict[str, Any] = field(default_factory=dict)
+    further_arguments: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def metrics(self) -> list[str]:
+        """Metrics of all tables and changes."""
+        columns = chain(self.columns, self.judged, self.also, *self.splits.values())
+        return list(dict.fromkeys(column.metric for column in columns))
 
     def arguments(self, reference: Reference) -> dict[str, Any]:
         """Arguments of `gymnasium.make` for a reference."""
-        return {**self.given, self.motion: reference}
+        return {**self.further_arguments, self.motion: reference}
 
     def label(self, reference: Reference) -> str:
         """Name of a reference in tables and figures."""
         return str(reference.get("kind") if isinstance(reference, dict) else reference)
 
     def abscissa(self, reference: Reference) -> dict[str, float]:  # noqa: ARG002
-        """Number of a reference that sweeps can be drawn against, by name; empty without one."""
+        """Number of a reference for the axis of a sweep, by name; empty without one."""
         return {}
 
     def draws(self, reference: Reference) -> bool:
-        """True if episodes of a reference have motions of their own."""
+        """True if every episode of a reference has a motion of its own."""
         make = self.make_reference
         return make is not None and make(reference).is_random
 
     def is_deterministic(self, scenario: str, reference: Reference) -> bool:
-        """True if all episodes of a condition are one and the same."""
-        if self.is_real:
-            return False
-        return not (make_scenario(scenario, self.walks).is_random or self.draws(reference))
+        """True if all episodes of a condition are the same."""
+        is_random = self.is_real or make_scenario(scenario, self.walks).is_random
+        return not (is_random or self.draws(reference))
 
     def differs_by_noise_alone(self, scenario: str, reference: Reference) -> bool:
-        """True if the episodes of a condition are of one robot and one motion."""
-        if self.is_real:
-            return False
-        return not (make_scenario(scenario, self.walks).draws_robots or self.draws(reference))
+        """True if all episodes of a condition have one robot and one motion."""
+        draws_robots = self.is_real or make_scenario(scenario, self.walks).draws_robots
+        return not (draws_robots or self.draws(reference))
 
     @property
     def failures(self) -> str:
-        """Name of such episodes in a sentence."""
+        """Name of failed episodes in a sentence."""
         return "falls" if self.failure == "falls" else "failures"
 
     def title(self, reference_name: str) -> str:
-        """A reference's name as it stands in titles."""
+        """Name of a reference in titles, with its quantity."""
         return f"{self.quantity} {reference_name}".strip()
 
 
-_STEPS_OF_THE_PAPER = {"24 s": 2}
-"""Number of steps of the gaits of configs/paper.yaml that have another one than the default."""
+_PAPER_NUM_STEPS = {"24 s": 2}
+"""Number of steps of the gaits of configs/paper.yaml, if it is not the default."""
 
 
 class _Walker(Environment):
     """The walker, whose reference is a step period, or a mapping with one."""
 
     def arguments(self, reference: Reference) -> dict[str, Any]:
-        given = reference if isinstance(reference, dict) else {}
-        return {**given, self.motion: _step_period(reference)}
+        further = reference if isinstance(reference, dict) else {}
+        return {**further, self.motion: _step_period(reference)}
 
     def label(self, reference: Reference) -> str:
         parts = _durations(reference)
         texts = (f"{p:g}" if isinstance(p, int | float) else str(p) for p in parts)
         label = f"{'+'.join(texts)} s"
-        given = reference if isinstance(reference, dict) else {}
-        steps = given.get("num_steps")
-        usual = Gait.model_fields["num_steps"].default
-        is_usual = steps in (None, usual, _STEPS_OF_THE_PAPER.get(label))
-        gait = given.get("gait")
-        differs = gait if isinstance(gait, dict) else {}
-        further = {**({} if is_usual else {"num_steps": steps}), **differs}
+        parameters = reference if isinstance(reference, dict) else {}
+        steps = parameters.get("num_steps")
+        default = Gait.model_fields["num_steps"].default
+        further = {}
+        if steps not in (None, default, _PAPER_NUM_STEPS.get(label)):
+            further["num_steps"] = steps
+        if isinstance(gait := parameters.get("gait"), dict):
+            further |= gait
         return " ".join([label, *(f"{name}={value}" for name, value in further.items())])
 
     def abscissa(self, reference: Reference) -> dict[str, float]:
@@ -299,7 +240,7 @@ class _Walker(Environment):
 
 
 def _step_period(reference: Reference) -> Any:
-    """Step period of a walker's reference, or its durations [s]."""
+    """Step period of a walker's reference, or its three durations [s]."""
     if not isinstance(reference, dict):
         return reference
     if "step_period" not in reference:
@@ -316,7 +257,7 @@ def _durations(reference: Reference) -> Any:
 
 
 def environment(name: str) -> Environment:
-    """The environment of a short name, or that of a robot of one's own.
+    """The environment of a short name, or of a user's robot.
 
     Args:
         name: Short name; a file of a robot, see `read_robot_file`; or "FILE.py:ROBOT" or
@@ -326,9 +267,9 @@ def environment(name: str) -> Environment:
         ConfigurationError: It does not exist.
     """
     if name.endswith(ENDINGS):
-        return replace(ENVIRONMENTS["robot"], given=read_robot_file(name))
+        return replace(ENVIRONMENTS["robot"], further_arguments=read_robot_file(name))
     if ":" in name:
-        return _of_ones_own(name)
+        return _user_robot(name)
     if name not in ENVIRONMENTS:
         choices = [*ENVIRONMENTS, "ROBOT.yaml", "FILE.py:ROBOT"]
         raise unknown_name("environment", name, choices)
@@ -336,19 +277,19 @@ def environment(name: str) -> Environment:
 
 
 @lru_cache(maxsize=64)
-def _of_ones_own(name: str) -> Environment:
+def _user_robot(name: str) -> Environment:
     robot = named_object(name)
     if not isinstance(robot, JointRobot):
         raise ConfigurationError(
             f"{name} is no elastic_env.JointRobot but of type {type(robot).__name__}"
         )
     robot.register()
-    known = _EVERY["joints" if robot.end_effector is None else "end_effector"]
-    return replace(known, id=robot.id, robot=robot.name)
+    description = _DESCRIPTIONS["joints" if robot.end_effector is None else "end_effector"]
+    return replace(description, id=robot.id, robot=robot.name)
 
 
-def _environments() -> dict[str, Environment]:
-    """Environments by their short names, from `environments.toml`."""
+def _read_descriptions() -> dict[str, Environment]:
+    """Read the descriptions in `environments.toml`, by short name."""
     file = Path(__file__).with_suffix(".toml")
     parts = tomllib.loads(file.read_text(encoding="utf-8"))
 
@@ -357,18 +298,18 @@ def _environments() -> dict[str, Environment]:
         like = part.pop("like", None)
         return part if like is None else {**values(like), **part}
 
-    plain = TypeAdapter(Environment)
+    standing = TypeAdapter(Environment)
     walking = TypeAdapter(_Walker)
-    found = {}
-    for name in [*IDS, *_KINDS]:
+    descriptions = {}
+    for name in [*IDS, *_USER_ROBOTS]:
         content = {"id": IDS.get(name, ""), "robot": name, **values(name)}
-        kind = walking if content.get("walks") else plain
-        found[name] = kind.validate_python(content)
-    return found
+        kind = walking if content.get("walks") else standing
+        descriptions[name] = kind.validate_python(content)
+    return descriptions
 
 
-_KINDS = ("joints", "end_effector")
-"""Descriptions of robots that are no environments of ours."""
-_EVERY = _environments()
-ENVIRONMENTS = {name: known for name, known in _EVERY.items() if name not in _KINDS}
-"""Environments by their short names."""
+_USER_ROBOTS = ("joints", "end_effector")
+"""Descriptions for robots of users, without and with an end effector."""
+_DESCRIPTIONS = _read_descriptions()
+ENVIRONMENTS = {name: e for name, e in _DESCRIPTIONS.items() if name not in _USER_ROBOTS}
+"""Environments of the package by their short names."""

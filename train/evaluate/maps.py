@@ -1,4 +1,4 @@
-"""Maps over two axes: which policy is best where, and what learning adds to the best.
+"""Maps over two axes: the best policy of every cell, and the gain of learning against it.
 
 An axis is a field of the scenario, such as the stiffness, or the motion, such as the step period.
 """
@@ -26,8 +26,9 @@ from train.evaluate.conditions import (
 )
 from train.evaluate.environments import Column, Environment
 from train.evaluate.episodes import Evaluation, group_by
+from train.evaluate.scores import failures, score
 from train.evaluate.statistics import Estimate
-from train.evaluate.table import EpisodeTable, failures, score
+from train.evaluate.table import EpisodeTable
 
 _UNITS = {"rad": ("mrad", 1e3), "m": ("mm", 1e3)}
 """Units in which an axis is shown, with the factor from SI."""
@@ -47,7 +48,7 @@ class Axis(Model):
 
     @property
     def is_motion(self) -> bool:
-        """True if it varies the motion, and not the scenario."""
+        """True if it varies the motion instead of the scenario."""
         return not self.what.startswith(SCENARIO)
 
     @property
@@ -62,17 +63,18 @@ class Axis(Model):
         kind = "half-width, " if self.what.endswith(f".{HALF_WIDTH}") else ""
         return f"{kind}{description.split(': ')[-1]} [{_UNITS.get(unit, (unit, 1.0))[0]}]"
 
-    def ticks(self, known: Environment) -> list[str]:
-        """Its values as they are shown."""
+    def ticks(self, environment: Environment) -> list[str]:
+        """Texts of its values, in their shown unit."""
         if self.is_motion:
-            motions = [known.arguments(value)[known.motion] for value in self.values]
-            numbers = [n for motion in motions for n in known.abscissa(motion).values()]
-            return [f"{n:g}" for n in numbers] or list(map(known.label, motions))
+            name = environment.motion
+            motions = [environment.arguments(value)[name] for value in self.values]
+            numbers = [n for motion in motions for n in environment.abscissa(motion).values()]
+            return [f"{n:g}" for n in numbers] or list(map(environment.label, motions))
         factor = _UNITS.get(scenario_fields()[self.what][1], ("", 1.0))[1]
         return [f"{factor * value:.4g}" for value in self.values]
 
     def place(self, condition: Condition) -> int:
-        """Which of its values a condition has."""
+        """Index of the value of a condition."""
         if not self.is_motion:
             return self.values.index(condition.swept[self.what])
         arguments = condition.environment.arguments
@@ -97,36 +99,37 @@ class MapConfig(Model):
 
     @property
     def axes(self) -> tuple[Axis, Axis]:
-        """Both."""
+        """Both axes."""
         return self.x, self.y
 
     @property
     def motion(self) -> Axis | None:
-        """The axis that varies the motion; None where both vary the scenario."""
+        """The axis that varies the motion; None if both vary the scenario."""
         return next((axis for axis in self.axes if axis.is_motion), None)
 
-    def require(self, known: Environment) -> None:
-        """Refuse axes that an environment does not have, and values that they cannot take.
+    def require(self, environment: Environment) -> None:
+        """Refuse axes that an environment does not have, and values beyond their bounds.
 
         Raises:
             ConfigurationError: An axis or a value is wrong.
         """
         for name, axis in (("x", self.x), ("y", self.y)):
-            if axis.what != known.motion and axis.what not in scenario_fields():
-                choices = choices_listed(axis.what, [known.motion, *scenario_fields()])
+            names = [environment.motion, *scenario_fields()]
+            if axis.what not in names:
+                choices = choices_listed(axis.what, names)
                 if axis.what in PolicyOptions.model_fields:
                     choices += "; an option of the policies is varied by sweep, not by a map"
                 raise ConfigurationError(f"unknown axis {axis.what!r} of map.{name}; {choices}")
+            if axis.is_motion:
+                continue  # values of the motion are `references`, which are checked
             for value in axis.values:
-                if axis.is_motion:
-                    continue  # `references` holds and checks them
                 if isinstance(value, bool) or not isinstance(value, int | float):
                     problem = f"values of map.{name} must be numbers"
                     raise ConfigurationError(f"{problem}, got {quote(value)}")
                 vary_scenario(GROUNDS["nominal"], {axis.what: value})
 
     def coordinates(self) -> list[dict[str, float]]:
-        """Fields of the scenario in every cell, for one motion."""
+        """Varied fields of the scenario in every cell of one motion."""
         fields = [axis for axis in self.axes if not axis.is_motion]
         names = [axis.what for axis in fields]
         return [
@@ -140,12 +143,12 @@ class MapCell:
     """One cell of a map.
 
     Attributes:
-        levels: Mean score of every policy over the episodes that did not fail; of residuals over
+        levels: Mean score of every policy over the episodes that did not fail, for residuals over
             training seeds [SI].
-        failed: Episodes of every policy that failed, and all.
-        best: The best policy; None where no episode of any reached its end.
-        best_analytic: The best one without learning and with the standard sensors.
-        learned: Paired change of every residual against that one.
+        failed: Number of failed episodes and of all episodes, for every policy.
+        best: The best policy; None if no episode of any policy reached its end.
+        best_analytic: The best policy without learning and with the standard sensors.
+        learned: Paired change of every residual against `best_analytic`.
     """
 
     levels: Mapping[str, Estimate]
@@ -157,7 +160,7 @@ class MapCell:
 
 @dataclass(frozen=True, eq=False)
 class HeatMap:
-    """A metric over both axes, in one scenario and, where no axis is the motion, with one motion.
+    """A metric over both axes, in one scenario; with one motion if no axis varies it.
 
     Attributes:
         title: Scenario and motion.
@@ -175,9 +178,9 @@ class HeatMap:
 
     @property
     def ticks(self) -> tuple[list[str], list[str]]:
-        """Values of x and y as they are shown."""
-        known = self.table.environment
-        return self.axes.x.ticks(known), self.axes.y.ticks(known)
+        """Texts of the values of x and y."""
+        environment = self.table.environment
+        return self.axes.x.ticks(environment), self.axes.y.ticks(environment)
 
     @property
     def flat(self) -> list[MapCell]:
@@ -186,13 +189,13 @@ class HeatMap:
 
     @property
     def wins(self) -> dict[str, int]:
-        """Cells in which a policy is the best, of those that are somewhere, most first."""
+        """Number of cells in which each policy is the best, most first; policies with any alone."""
         wins = Counter(cell.best for cell in self.flat)
         ranked = sorted(self.table.policies, key=lambda title: -wins[title])
         return {title: wins[title] for title in ranked if wins[title]}
 
     def changes_of(self, title: str) -> list[Change]:
-        """Changes of a residual in all cells that have one."""
+        """Changes of a residual in all cells that have any."""
         return [cell.learned[title] for cell in self.flat if title in cell.learned]
 
 
@@ -205,26 +208,26 @@ def heat_maps(evaluations: Sequence[Evaluation], config: MapConfig) -> list[Heat
     """
 
     def title_of(e: Evaluation) -> str:
-        own = e.condition
-        motion = own.environment.title(own.reference_name)
-        return own.scenario if config.motion else f"{motion}, {own.scenario}"
+        condition = e.condition
+        motion = condition.environment.title(condition.reference_name)
+        return condition.scenario if config.motion else f"{motion}, {condition.scenario}"
 
     return [
         heat_map
-        for title, own in group_by(evaluations, title_of).items()
-        for heat_map in _heat_maps(title, EpisodeTable(own), config)
+        for title, group in group_by(evaluations, title_of).items()
+        for heat_map in _heat_maps(title, EpisodeTable(group), config)
     ]
 
 
 Scores = Mapping[str, tuple[Estimate, tuple[int, int]]]
-"""Score of every policy, and how many of its episodes failed, of how many."""
+"""Score of every policy, with the number of its failed episodes and of all its episodes."""
 
 
 def ranking(scores: Scores) -> list[str]:
-    """The policies that have a score, the best first: fewer failures go before a lower score.
+    """The policies that have a score, the best first: fewer failures, then the lower score.
 
-    A mean over the episodes that did not fail flatters whoever fails in the hard ones, so failures
-    count first.
+    Failures count first. The score is a mean over episodes that did not fail, so it would favour a
+    policy that fails in the hard ones.
     """
 
     def rank(title: str) -> tuple[float, float]:
@@ -235,12 +238,12 @@ def ranking(scores: Scores) -> list[str]:
 
 
 def best_of(scores: Scores) -> str | None:
-    """The best policy of a `ranking`; None where nobody has a score."""
+    """The best policy of a `ranking`; None if no policy has a score."""
     return next(iter(ranking(scores)), None)
 
 
 def _heat_maps(title: str, table: EpisodeTable, config: MapConfig) -> list[HeatMap]:
-    """A map per judged metric."""
+    """One map per judged metric."""
     cells = {
         (config.y.place(condition), config.x.place(condition)): cell
         for (_, cell), condition in table.conditions.items()
@@ -249,21 +252,21 @@ def _heat_maps(title: str, table: EpisodeTable, config: MapConfig) -> list[HeatM
     rows = [[cells[y, x] for x in across] for y in range(len(config.y.values))]
     maps = []
     for column in table.environment.judged:
-        found = [[_cell(table, number, column) for number in row] for row in rows]
-        maps.append(HeatMap(title, column, config, table, found))
+        map_cells = [[_map_cell(table, number, column) for number in row] for row in rows]
+        maps.append(HeatMap(title, column, config, table, map_cells))
     return maps
 
 
-def _cell(table: EpisodeTable, cell: int, column: Column) -> MapCell:
-    """Scores of one cell, and residuals against the best policy without learning there."""
-    played = [title for title in table.policies if (title, cell) in table.conditions]
-    rows = {title: table.of(title, cell) for title in played}
+def _map_cell(table: EpisodeTable, cell: int, column: Column) -> MapCell:
+    """Scores of one cell, and changes of residuals against the best policy without learning."""
+    titles = [title for title in table.policies if (title, cell) in table.conditions]
+    rows = {title: table.rows_of(title, cell) for title in titles}
     scores = {title: (score(own, column), failures(own)) for title, own in rows.items()}
-    tracks = {title: table.conditions[title, cell].track for title in played}
-    standard = [title for title in played if tracks[title] is Track.STANDARD]
-    without_truth = [title for title in played if tracks[title] is not Track.TRUTH]
+    tracks = {title: table.conditions[title, cell].track for title in titles}
+    standard = [title for title in titles if tracks[title] is Track.STANDARD]
+    without_truth = [title for title in titles if tracks[title] is not Track.TRUTH]
     analytic = best_of({title: scores[title] for title in standard})
-    learned = [title for title in played if title in table.members] if analytic else []
+    learned = [title for title in titles if title in table.members] if analytic else []
     return MapCell(
         levels={title: level for title, (level, _) in scores.items()},
         failed={title: failed for title, (_, failed) in scores.items()},

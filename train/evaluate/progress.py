@@ -1,4 +1,4 @@
-"""The evaluations on the way of a training, read without the code that trained it."""
+"""Evaluations during a training, read from its table without the code that trained it."""
 
 import csv
 from collections.abc import Mapping, Sequence
@@ -15,7 +15,7 @@ from train.evaluate.environments import Column
 
 PROGRESS = "progress.csv"
 MOST_BYTES = 20_000_000
-"""Bytes of the table."""
+"""Largest size of the table."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,8 +23,8 @@ class Curves:
     """Learning curves of the training seeds of a residual.
 
     Attributes:
-        decisions: Decisions at the evaluations that all of them have, (n,).
-        ratios: Metric over the base's, mean over scenarios, (seeds, n), by metric; nan where all
+        decisions: Decisions at the evaluations that all training seeds have, (n,).
+        ratios: By metric, its ratio to the base's, mean over scenarios, (seeds, n); nan where all
             episodes of a scenario failed.
     """
 
@@ -35,15 +35,15 @@ class Curves:
 def read_progress(
     folder: Path, metrics: Sequence[str] = (), further: Sequence[str] = ()
 ) -> list[dict[str, Any]]:
-    """Evaluations on the way of a training seed, as its `progress.csv` has them.
+    """Read the evaluations of a training seed from its `progress.csv`.
 
     Args:
-        folder: Of the training seed.
-        metrics: Scores that are needed, of the policy and of its base.
-        further: Other columns that are needed.
+        folder: Folder of the training seed.
+        metrics: Required scores, of the policy and of its base.
+        further: Other required columns.
 
     Raises:
-        ConfigurationError: The file is missing, is no such table, or lacks a score.
+        ConfigurationError: The file is missing, is no such table, or lacks a column.
     """
     path = folder / PROGRESS
     bases = [f"base_{metric}" for metric in metrics]
@@ -64,20 +64,20 @@ def read_progress(
 
 def _evaluation(row: Mapping[str, str], columns: Sequence[str]) -> dict[str, Any]:
     """Numbers of a row, and its scenario."""
-    found: dict[str, Any] = {"scenario": row["scenario"]}
-    found |= {name: float(value) for name, value in row.items() if name != "scenario"}
+    values: dict[str, Any] = {"scenario": row["scenario"]}
+    values |= {name: float(text) for name, text in row.items() if name != "scenario"}
     for name in columns:
-        if found[name] == 0.0 and name.startswith("base_"):
+        if values[name] == 0.0 and name.startswith("base_"):
             raise ValueError(f"{name} is zero")
-    return found
+    return values
 
 
 def learning_curves(folders: Sequence[str], columns: Sequence[Column]) -> Curves | None:
-    """Curves of policies that lie beside a whole `progress.csv`; None where one does not.
+    """Curves of policies from the `progress.csv` next to each; None if one is missing or damaged.
 
     Args:
         folders: Folders of the policies, such as runs/NAME/seed_0/last.
-        columns: Metrics that training was evaluated by.
+        columns: Metrics of the evaluations during training.
     """
     metrics = [column.metric for column in columns]
     runs = [Path(folder).resolve().parent for folder in folders]

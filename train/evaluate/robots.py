@@ -1,4 +1,4 @@
-"""Scores over drawn robots: the middle half of them, the worst tenth, and against the base."""
+"""Scores over drawn robots: their middle half, their worst tenth, and wins against the base."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,19 +9,12 @@ import pandas as pd
 from train.evaluate.changes import opponents
 from train.evaluate.environments import Column
 from train.evaluate.episodes import Evaluation
+from train.evaluate.scores import failures, over_cells, pair, per_robot, score
 from train.evaluate.statistics import Estimate, mean_of_part, middle_half, worst_share
-from train.evaluate.table import (
-    EpisodeTable,
-    Scope,
-    failures,
-    over_cells,
-    pair,
-    per_robot,
-    score,
-)
+from train.evaluate.table import EpisodeTable, Scope
 
 FEWEST_ROBOTS = 4
-"""Episodes from which on there is a middle half."""
+"""Fewest robots that have a middle half."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,9 +26,9 @@ class RobotScores(Scope):
         mean: Mean over the robots [SI].
         middle: Interquartile mean over the robots [SI].
         worst: Mean of the worst tenth of the robots [SI].
-        failed, episodes: Episodes that failed, and all. The figures are of the others.
-        better: Share of the robots for which the policy is better than another one, by its title;
-            ties count half, and to fail is worse than any value.
+        failed, episodes: Episodes that failed, and all. The means are over those that did not.
+        better: Share of the robots for which the policy is better than another one, by the title
+            of the other. Ties count half; a failure is worse than any value.
     """
 
     column: Column
@@ -48,32 +41,27 @@ class RobotScores(Scope):
 
     @property
     def scores(self) -> tuple[Estimate, Estimate, Estimate]:
-        """The three figures over the robots."""
+        """The three means over the robots."""
         return self.mean, self.middle, self.worst
 
 
 def robot_scores(evaluations: Sequence[Evaluation]) -> list[RobotScores]:
-    """A row per cell and judged metric, of the cells that draw robots and have enough of them.
+    """Return a row per judged metric and cell, for cells that draw enough robots.
 
     Args:
         evaluations: All cells, one per training seed.
     """
     table = EpisodeTable(evaluations)
-    found = []
+    result = []
     for policy, others in opponents(table).items():
         for scope in table.scopes(policy, {}):
             (cell,) = scope.cells
-            rows = table.of(policy, cell)
+            rows = table.rows_of(policy, cell)
             is_small = len(set(rows["seed"])) < FEWEST_ROBOTS
             if scope.swept or is_small or not scope.first.draws_robots:
                 continue
-            against = [other for other in others if (other, cell) in table.conditions]
             failed, episodes = failures(rows)
-            beside = {title: table.of(title, cell) for title in against}
             for column in table.environment.judged:
-                better = {}
-                for title, theirs in beside.items():
-                    better[title] = share_better(rows, theirs, column.metric)
                 scores = RobotScores(
                     **vars(scope),
                     column=column,
@@ -82,18 +70,22 @@ def robot_scores(evaluations: Sequence[Evaluation]) -> list[RobotScores]:
                     worst=score(rows, column, mean_of_part(worst_share)),
                     failed=failed,
                     episodes=episodes,
-                    better=better,
+                    better={
+                        title: share_better(rows, table.rows_of(title, cell), column.metric)
+                        for title in others
+                        if (title, cell) in table.conditions
+                    },
                 )
-                found.append(scores)
-    return found
+                result.append(scores)
+    return result
 
 
 def share_better(mine: pd.DataFrame, base: pd.DataFrame, metric: str) -> Estimate:
     """Share of the robots for which a policy is better (lower).
 
-    Ties count half. To fail is worse than any value, and where both fail it is a tie. nan where
-    they have no robot in common. An episode that reached its end without a figure, such as a ZMP
-    of feet that never carried anything, is left out.
+    Ties count half. A failure is worse than any value, and two failures are a tie. The share is nan
+    if the policies have no robot in common. An episode that reached its end without a value is left
+    out, such as a ZMP of feet that never carried anything.
 
     Args:
         mine: Episodes of one cell with `member`, `cell`, `robot`, `seed`, `failed` and the metric.

@@ -28,11 +28,11 @@ from train.runs.failures import is_disk_full
 from train.runs.user_code import named_object, user_line
 
 Watch = Callable[[int, Any, Any, Any], None]
-"""Sees number, observation, info and memory of a control step, before the world moves."""
+"""Called with number, observation, info and memory of a control step, before the world moves."""
 
 
 class PolicyFailedError(ElasticError):
-    """A policy raised, or commanded what no action can be."""
+    """A policy raised an exception, or returned an invalid action."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,9 +45,9 @@ class ControlStep:
         action: Its command.
         observation: Observation after the step.
         info: Info after the step.
-        terminated: Worlds that failed in this step, (num_worlds,); of a scalar environment one
-            truth value.
-        truncated: Worlds that reached their end.
+        terminated: True for worlds that failed in this step, (num_worlds,); one value for a scalar
+            environment.
+        truncated: True for worlds that reached their end in this step.
     """
 
     number: int
@@ -71,17 +71,17 @@ def control_steps(
     condition: Condition | None = None,
     watch: Watch | None = None,
 ) -> Iterator[ControlStep]:
-    """Play a policy from a reset on, one control step at a time, in one world or in many.
+    """Play a policy after a reset, one control step at a time, in one world or in many.
 
-    A scalar environment stops at the end of its episode. The worlds of a vector environment go on,
-    each with the next episode, and whoever reads the steps stops when there are enough. In mode
-    `DISABLED` the steps end when all worlds have ended; what one does after its end means nothing.
+    A scalar environment stops at the end of its episode. Each world of a vector environment goes on
+    with its next episode, until the caller takes no further step. In mode `DISABLED` the steps end
+    when all worlds have ended; steps of a world after its end have no meaning.
 
     Args:
         env: The environment.
-        policy: Anything with `predict`.
-        seed: Of the reset; of a vector environment one for each world, or one for all.
-        condition: What is played, for the errors of the policy; None to let them pass.
+        policy: Any object with `predict`.
+        seed: Seed of the reset; for a vector environment one for each world, or one for all.
+        condition: Condition that errors of the policy name; None to raise them unchanged.
         watch: Called between the command and the step.
 
     Raises:
@@ -96,39 +96,39 @@ def control_steps(
     has_ended = np.zeros_like(begins)
     for number in count():
         with nullcontext() if condition is None else policy_errors(condition, number):
-            answer = policy.predict(
+            result = policy.predict(
                 observation, state=memory, episode_start=begins, deterministic=True
             )
-            if not isinstance(answer, tuple) or len(answer) != 2:
-                kind = type(answer).__name__
+            if not isinstance(result, tuple) or len(result) != 2:
+                kind = type(result).__name__
                 raise ConfigurationError(f"predict must return (action, state), got {kind}")
-            action, memory = answer
+            action, memory = result
             if watch is not None:
                 watch(number, observation, info, memory)
-            after, _, terminated, truncated, info = env.step(action)
+            next_observation, _, terminated, truncated, info = env.step(action)
         ends = (terminated, truncated)
-        step = ControlStep(number, observation, action, after, info, *ends)
+        step = ControlStep(number, observation, action, next_observation, info, *ends)
         yield step
-        observation = after
+        observation = next_observation
         is_over = step.is_over
         has_ended = has_ended | is_over
         if mode in (None, AutoresetMode.DISABLED) and has_ended.all():
             return
-        # by itself a world begins anew in the step after its end
+        # in mode NEXT_STEP a world begins its next episode in the step after its end
         begins = was_over if mode is AutoresetMode.NEXT_STEP else is_over
         was_over = is_over
 
 
 @contextmanager
 def policy_errors(condition: Condition, step: int | None = None) -> Iterator[None]:
-    """Say of what a policy does within whose it is, and where.
+    """Name the policy and the place in errors that a policy raises within the context.
 
     Args:
-        condition: What is played.
-        step: Control step; None where nobody counts.
+        condition: Condition that is played.
+        step: Control step; None if steps are not counted.
 
     Raises:
-        PolicyFailedError: It raises, ends the program, or its action is none.
+        PolicyFailedError: The policy raises, ends the program, or its action is invalid.
     """
     try:
         yield
@@ -151,7 +151,7 @@ def make_policy(spec: PolicySpec, env: Any, options: Any = None) -> Any:
     Args:
         spec: The specification.
         env: The environment.
-        options: Options by name instead of its own.
+        options: Options by name that replace those of the specification; None for these.
 
     Raises:
         ConfigurationError: The name is neither a baseline nor an importable function.
@@ -162,11 +162,11 @@ def make_policy(spec: PolicySpec, env: Any, options: Any = None) -> Any:
     try:
         function = named_object(spec.name)
     except ConfigurationError as error:
-        raise _not_a_policy(spec, str(error)) from error
+        raise _policy_error(spec, str(error)) from error
     attribute = spec.name.rpartition(":")[2]
     if not callable(function):
         kind = type(function).__name__
-        raise _not_a_policy(spec, f"{attribute} is no function but of type {kind}")
+        raise _policy_error(spec, f"{attribute} is no function but of type {kind}")
     _require_options(spec, function, options)
     try:
         return function(env, **options)
@@ -175,25 +175,25 @@ def make_policy(spec: PolicySpec, env: Any, options: Any = None) -> Any:
     except Exception as error:
         place = user_line(error)
         problem = f"{attribute}(env, ...) raised{place} {type(error).__name__}: {error}"
-        raise _not_a_policy(spec, problem) from error
+        raise _policy_error(spec, problem) from error
 
 
 def _require_options(spec: PolicySpec, function: Callable[..., Any], options: Any) -> None:
-    """Refuse options that a policy's function does not take.
+    """Refuse options that the function of a policy does not accept.
 
     Raises:
-        ConfigurationError: There is one.
+        ConfigurationError: The function does not accept an option.
     """
     try:
         _, *parameters = inspect.signature(function).parameters.values()
-    except (TypeError, ValueError):  # one that does not say what it takes
+    except (TypeError, ValueError):  # a callable without a signature
         return
     if all(parameter.kind is not parameter.VAR_KEYWORD for parameter in parameters):
         names = [parameter.name for parameter in parameters]
         require_known(f"option of the policy {spec.name!r}", options, names)
 
 
-def _not_a_policy(spec: PolicySpec, problem: str) -> ConfigurationError:
+def _policy_error(spec: PolicySpec, problem: str) -> ConfigurationError:
     return ConfigurationError(
         f"policy {spec.name!r}: {problem}; give a baseline, such as input, or"
         ' "FILE.py:function" or "module:function", a function or class that takes the environment'
@@ -214,8 +214,8 @@ def make_vector_env(
         condition: The condition.
         num_envs: Worlds.
         num_threads: Threads of the physics, 0 for all cores.
-        autoreset_mode: When worlds begin anew.
-        **others: Arguments of the environment in place of the condition's.
+        autoreset_mode: When worlds begin their next episode.
+        **others: Arguments of the environment that replace those of the condition.
 
     Raises:
         ConfigurationError: Unknown environment, scenario, reference or argument.
@@ -235,38 +235,36 @@ def make_shared_env(
     num_threads: int = 0,
     autoreset_mode: AutoresetMode = AutoresetMode.NEXT_STEP,
 ) -> Any:
-    """A vector environment with a world of each condition, see `shared_settings`.
+    """A vector environment with one world of each condition, see `shared_settings`.
 
     Raises:
         ConfigurationError: Unknown environment, scenario, reference or argument.
     """
     scenario: Any = [condition.scenario_played for condition in conditions]
-    first = conditions[0]
-    if all(own == scenario[0] for own in scenario):
+    if all(each == scenario[0] for each in scenario):
         scenario = scenario[0]
     others = {"autoreset_mode": autoreset_mode, "scenario": scenario}
-    return make_vector_env(first, len(conditions), num_threads, **others)
+    return make_vector_env(conditions[0], len(conditions), num_threads, **others)
 
 
 def shared_settings(condition: Condition) -> str:
-    """Settings that conditions must share to share a vector environment.
+    """Settings that conditions of one vector environment have in common, as a text.
 
-    That is everything but the scenario of a walker, of which a policy knows the friction and the
-    rate of the IMU.
+    These are all settings. From the scenario of a walker they are only the friction and the rate of
+    the IMU, which a policy knows.
     """
     walks = condition.environment.walks
-    scenario = make_scenario(condition.scenario_played, walks)
-    known: Any = scenario
+    scenario: Any = make_scenario(condition.scenario_played, walks)
     if walks:
-        known = (scenario.friction_scale, scenario.pelvis_imu.rate_hz)
-    return repr((condition.env, {**condition.arguments, "scenario": known}))
+        scenario = (scenario.friction_scale, scenario.pelvis_imu.rate_hz)
+    return repr((condition.env, {**condition.arguments, "scenario": scenario}))
 
 
 def can_share_worlds(condition: Condition) -> bool:
-    """True if its policy does the same beside worlds of other scenarios.
+    """True if its policy acts the same in a vector environment with other scenarios.
 
-    Nobody knows that of code of one's own. The truth of several scenarios is none, and trials are
-    of one.
+    A user's own code may not. A policy that reads the truth, or learns in trials, needs one
+    scenario.
     """
     name = condition.policy.name
     if ":" in name and not is_saved(name):
@@ -275,13 +273,13 @@ def can_share_worlds(condition: Condition) -> bool:
 
 
 def single_world_envs(conditions: Iterable[Condition]) -> Iterator[tuple[Condition, Any]]:
-    """Conditions with an environment of one world, shared by those that differ by the policy."""
-    made: dict[str, Any] = {}
+    """Yield conditions with an environment of one world; those of the same world share it."""
+    envs: dict[str, Any] = {}
     for condition in conditions:
         key = repr((condition.env, condition.arguments))
-        if key not in made:
-            made[key] = make_vector_env(condition, 1)
-        yield condition, made[key]
+        if key not in envs:
+            envs[key] = make_vector_env(condition, 1)
+        yield condition, envs[key]
 
 
 def num_steps(conditions: Iterable[Condition]) -> list[int]:

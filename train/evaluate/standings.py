@@ -1,4 +1,4 @@
-"""The leaderboard of a comparison: scores over groups of scenarios, in tracks by needs."""
+"""The leaderboard of a comparison: scores over groups of scenarios, in tracks by the needs."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -10,21 +10,22 @@ from train.evaluate.changes import change_of
 from train.evaluate.environments import Column
 from train.evaluate.episodes import Evaluation, group_by
 from train.evaluate.maps import best_of
+from train.evaluate.scores import failures, score
 from train.evaluate.statistics import Estimate
-from train.evaluate.table import EpisodeTable, Groups, Scope, failures, score
+from train.evaluate.table import EpisodeTable, Groups, Scope
 
 
 @dataclass(frozen=True)
-class Paired:
+class PairedChange:
     """A paired change of a residual.
 
     Attributes:
-        to: Title of the policy that it is compared with.
+        opponent: Title of the policy that it is compared with.
         change: Change of its score on the same episodes [1].
         verdict: As `Change.verdict`.
     """
 
-    to: str
+    opponent: str
     change: Estimate
     verdict: str
 
@@ -34,28 +35,28 @@ class Standing:
     """A policy in one metric, in one scenario or over a group of them: a row of `leaderboard.csv`.
 
     Attributes:
-        track: What the policy needs.
+        track: Needs of the policy.
         policy: Its title.
         reference: Label of the motion.
         scope: Scenario, or name of the group.
-        is_group: Whether it is a group.
-        is_column: Whether it is a column of the leaderboard; else it stands in the table of single
+        is_group: True for a group.
+        is_column: True for a column of the leaderboard; otherwise the row is in the table of single
             scenarios.
         title: Words for the metric.
         metric: Its name, with its unit in SI.
-        score: Mean over scenarios of means over the robots that did not fail; of residuals the
-            interquartile mean over training seeds; nan where a scenario has no such episode. Its
+        score: Mean over scenarios of means over the robots that did not fail; for residuals the
+            interquartile mean over training seeds; nan if a scenario has no such episode. Its
             interval is over training seeds and drawn robots.
         failed, episodes: Episodes that failed, and all.
-        training_seeds: Of a residual; 0 of another policy.
-        base: Of a residual: its change against its base.
-        rival: Of a residual: its change against the best policy without learning and with the
-            standard sensors, in the same scope and metric. It is chosen on the same episodes, which
+        training_seeds: Training seeds of a residual; 0 for another policy.
+        base: Change of a residual against its base; None for another policy.
+        rival: Change of a residual against the best policy without learning and with the standard
+            sensors, in the same scope and metric. The rival is chosen on the same episodes, which
             favours it.
         step_us: Median time of the policy alone for a control step of one world [µs].
-        interval_over: What the interval of the score is over; empty without one.
-        origin: Version and protocol that it was played with, which rows of one leaderboard share.
-        is_published: Whether it was read from a file, and not played.
+        interval_over: Units of the score's interval, such as "64 robots"; empty without one.
+        origin: Version and protocol of the rollouts, which rows of one leaderboard share.
+        is_published: True if the row was read from a file instead of played.
     """
 
     track: Track
@@ -70,8 +71,8 @@ class Standing:
     failed: int
     episodes: int
     training_seeds: int
-    base: Paired | None
-    rival: Paired | None
+    base: PairedChange | None
+    rival: PairedChange | None
     step_us: float
     interval_over: str = ""
     origin: str = ""
@@ -79,7 +80,7 @@ class Standing:
 
 
 def append_standings(published: Sequence[Standing], own: Sequence[Standing]) -> list[Standing]:
-    """A published leaderboard with one's own rows behind; bases that both have stay published.
+    """Return a published leaderboard followed by own rows; a policy in both stays published.
 
     Args:
         published: Rows that were read.
@@ -93,12 +94,13 @@ def append_standings(published: Sequence[Standing], own: Sequence[Standing]) -> 
     if theirs.keys() != ours.keys():
         there, here = (" and ".join(origins) or "nothing" for origins in (theirs, ours))
         raise ConfigurationError(
-            f"published rows must be played as one's own, there by {there or 'an unknown version'},"
-            f" here by {here}; the protocol is motions, scenarios, groups, episodes and seed"
+            "published rows and your own must have the same version and protocol, got"
+            f" {there or 'an unknown version'} and {here}; the protocol is motions, scenarios,"
+            " groups, episodes and seed"
         )
-    known = {row.policy for row in published}
-    kept = [replace(row, is_published=True) for row in published]
-    return [*kept, *(row for row in own if row.policy not in known)]
+    policies = {row.policy for row in published}
+    marked = [replace(row, is_published=True) for row in published]
+    return [*marked, *(row for row in own if row.policy not in policies)]
 
 
 def standings(
@@ -109,8 +111,8 @@ def standings(
 ) -> list[Standing]:
     """The leaderboard, a row per policy, motion, scope and judged metric.
 
-    Columns are, for each motion, the groups whose scenarios are all played with it, and the
-    scenarios that are in none of these groups.
+    Each motion has a column for every group whose scenarios are all played with it. Scenarios in
+    none of these groups have columns of their own.
 
     Args:
         evaluations: All cells, one per training seed.
@@ -120,26 +122,26 @@ def standings(
     """
     table = EpisodeTable(evaluations)
     scopes = [s for title in table.policies for s in table.scopes(title, groups)]
-    parts_of = group_by(scopes, lambda scope: (scope.policy, scope.reference))
-    for own in parts_of.values():
-        own.sort(key=lambda scope: not scope.is_group)
-    scopes = list(chain(*parts_of.values()))
+    motions = group_by(scopes, lambda scope: (scope.policy, scope.reference))
+    for scopes_of_motion in motions.values():
+        scopes_of_motion.sort(key=lambda scope: not scope.is_group)
+    scopes = list(chain(*motions.values()))
     standard = [scope for scope in scopes if scope.first.track is Track.STANDARD]
     rivals = group_by(standard, lambda scope: scope.place)
-    found = []
+    result = []
     for scope in scopes:
-        parts = parts_of[scope.policy, scope.reference]
-        groups_of = [part.conditions for part in parts if part.is_group]
-        pooled = {condition.scenario for condition in chain(*groups_of)}
-        rows = table.of(scope.policy, *scope.cells)
+        scopes_of_motion = motions[scope.policy, scope.reference]
+        groups_of_motion = [s.conditions for s in scopes_of_motion if s.is_group]
+        pooled = {condition.scenario for condition in chain(*groups_of_motion)}
+        rows = table.rows_of(scope.policy, *scope.cells)
         failed, episodes = failures(rows)
         for column in table.environment.judged:
-            base = best = None
+            base = rival = None
             if scope.first.member is not None:
-                base = _paired(table, scope, scope.first.member.base, column)
-                beside = rivals.get(scope.place, [])
-                best = _paired(table, scope, _best(table, beside, column), column)
-            level = score(rows, column)
+                base = _paired_change(table, scope, scope.first.member.base, column)
+                best = _best_policy(table, rivals.get(scope.place, []), column)
+                rival = _paired_change(table, scope, best, column)
+            mean = score(rows, column)
             standing = Standing(
                 track=scope.first.track,
                 policy=scope.policy,
@@ -149,32 +151,34 @@ def standings(
                 is_column=scope.is_group or scope.scope not in pooled,
                 title=column.title,
                 metric=column.metric,
-                score=level,
+                score=mean,
                 failed=failed,
                 episodes=episodes,
                 training_seeds=len(table.members.get(scope.policy, ())),
                 base=base,
-                rival=best,
+                rival=rival,
                 step_us=step_us.get(scope.policy, float("nan")),
-                interval_over=level.over,
+                interval_over=mean.over,
                 origin=origin,
             )
-            found.append(standing)
-    return found
+            result.append(standing)
+    return result
 
 
-def _paired(table: EpisodeTable, scope: Scope, to: str, column: Column) -> Paired | None:
-    """A policy against another one; None where that does not play the same cells."""
-    if len(table.cells_of_base(scope, to)) < len(scope.cells):
+def _paired_change(
+    table: EpisodeTable, scope: Scope, opponent: str, column: Column
+) -> PairedChange | None:
+    """Change of a policy against another one; None if that one does not play the same cells."""
+    if len(table.cells_of_base(scope, opponent)) < len(scope.cells):
         return None
-    row = change_of(table, scope, to, column)
-    return Paired(to, row.relative, row.verdict)
+    row = change_of(table, scope, opponent, column)
+    return PairedChange(opponent, row.relative, row.verdict)
 
 
-def _best(table: EpisodeTable, scopes: Sequence[Scope], column: Column) -> str:
-    """The best of some policies; empty where none has a score."""
+def _best_policy(table: EpisodeTable, scopes: Sequence[Scope], column: Column) -> str:
+    """The best of some policies; empty if none has a score."""
     scores = {}
     for scope in scopes:
-        rows = table.of(scope.policy, *scope.cells)
+        rows = table.rows_of(scope.policy, *scope.cells)
         scores[scope.policy] = score(rows, column), failures(rows)
     return best_of(scores) or ""

@@ -1,11 +1,10 @@
 """Statistics over training seeds and robots: changes, interquartile means, bootstrap intervals.
 
-Learning draws the training seed at random, and a scenario draws robots. An interval is over both
-where there are several of both, and over the one of which there are several [Agarwal 2021, Colas
-2019]. All seeds play the same robots. So a resample draws seeds, and robots of every cell, and
-crosses the two [Owen 2007]. A policy is compared with its base on the same episodes. One that was
-not trained has nothing else that is random where one robot plays all episodes: there the interval
-is over these, which differ in noise, pushes and slopes.
+Training seeds are random, and a scenario draws robots at random. An interval is over seeds, robots
+or both, depending on which there are several of [Agarwal 2021, Colas 2019]. All seeds play the same
+robots. So a resample draws seeds, and robots of every cell, and crosses the two [Owen 2007]. A
+policy is compared with its base on the same episodes. If one robot plays all episodes of a policy
+without training, the interval is over the episodes. They differ in noise, pushes and slopes.
 
 [Agarwal 2021] R. Agarwal et al., "Deep Reinforcement Learning at the Edge of the Statistical
 Precipice", NeurIPS. [Colas 2019] C. Colas et al., "A Hitchhiker's Guide to Statistical Comparisons
@@ -26,25 +25,25 @@ from elastic_env.core.signals import Array, IntArray
 CONFIDENCE = 0.95
 RESAMPLES = 9999
 MOST_DRAWS = 10**7
-"""Units that all resamples draw at most: many episodes make fewer resamples, which need less."""
+"""Largest number of units that all resamples draw; it bounds the resamples of many episodes."""
 WORST = 0.1
 """Share of the robots that count as the worst ones."""
-_CUT = 0.25
+_TRIMMED_SHARE = 0.25
 _BOOTSTRAP_SEED = 0
 
 Counts: TypeAlias = Sequence[Array]
-"""How often every robot is in each resample, (resamples, robots) for every cell."""
+"""Number of times that each resample has each robot, (resamples, robots) for every cell."""
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """A figure over training seeds and drawn robots.
+    """An estimate over training seeds and drawn robots.
 
     Attributes:
-        value: The figure; nan where there is none.
-        low, high: 95 % interval over seeds and robots; None where there are fewer than two of each.
-        seeds, robots, episodes: Training seeds that the interval is over, drawn robots of all
-            cells, and episodes of one robot; 0 where it is not over them.
+        value: The estimate; nan if there is none.
+        low, high: 95 % interval over seeds and robots; None with fewer than two of both.
+        seeds, robots, episodes: Training seeds, drawn robots of all cells, and episodes of one
+            robot that the interval is over; 0 if it is not over them.
     """
 
     value: float
@@ -56,27 +55,23 @@ class Estimate:
 
     @property
     def has_interval(self) -> bool:
-        """True if there are training seeds or robots enough for an interval."""
+        """True if there are enough training seeds or robots for an interval."""
         return self.low is not None
 
     @property
     def over(self) -> str:
-        """What the interval is over: "10 training seeds and 64 robots"; empty without one."""
-        units = {
-            "training seeds": self.seeds,
-            "robots": self.robots,
-            "episodes": self.episodes,
-        }
+        """Units of the interval: "10 training seeds and 64 robots"; empty without one."""
+        units = {"training seeds": self.seeds, "robots": self.robots, "episodes": self.episodes}
         return " and ".join(f"{number} {unit}" for unit, number in units.items() if number)
 
     @property
     def is_known(self) -> bool:
-        """True if there is a figure."""
+        """True if there is a value."""
         return bool(np.isfinite(self.value))
 
     @property
     def ends(self) -> tuple[float, float]:
-        """Ends of the interval; twice the value where there is none."""
+        """Ends of the interval; the value twice without one."""
         if self.low is None or self.high is None:
             return self.value, self.value
         return self.low, self.high
@@ -88,11 +83,9 @@ class Estimate:
         return {name: self.value, f"{name}_low": low, f"{name}_high": high}
 
     def times(self, factor: float) -> "Estimate":
-        """In another unit; the factor is positive."""
-        ends: dict[str, Any] = {}
-        if self.low is not None and self.high is not None:
-            ends = {"low": factor * self.low, "high": factor * self.high}
-        return replace(self, value=factor * self.value, **ends)
+        """Return the estimate in another unit; the factor is positive."""
+        low, high = (None if end is None else factor * end for end in (self.low, self.high))
+        return replace(self, value=factor * self.value, low=low, high=high)
 
 
 def change(mine: Array, base: Array) -> Array:
@@ -104,8 +97,7 @@ def change(mine: Array, base: Array) -> Array:
         base: The base's means over the same episodes, (seeds, scenarios).
 
     Returns:
-        (seeds,); nan where a scenario has no pair: without it the mean would be one over other
-        scenarios.
+        (seeds,); nan if a scenario has no pair, since the mean would be over other scenarios.
     """
     mine = np.mean(mine, axis=-1)
     base = np.mean(base, axis=-1)
@@ -113,29 +105,19 @@ def change(mine: Array, base: Array) -> Array:
 
 
 def interquartile_mean(values: Array, axis: int = -1) -> Any:
-    """Mean of what is left without the lowest and the highest quarter, rounded down in number."""
-    # here: it takes half a second to load, and most programs need none of it
+    """Mean without the lowest and the highest quarter, each rounded down to whole values."""
+    # imported here: it takes half a second to load, and most programs do not need it
     from scipy import stats
 
-    # one nan, and SciPy goes row by row
+    # with any nan, SciPy would loop over the rows
     is_unknown = np.isnan(values).any(axis=axis, keepdims=True)
-    trimmed = stats.trim_mean(np.where(is_unknown, 0.0, values), _CUT, axis=axis)
+    trimmed = stats.trim_mean(np.where(is_unknown, 0.0, values), _TRIMMED_SHARE, axis=axis)
     return np.where(np.squeeze(is_unknown, axis=axis), np.nan, trimmed)[()]
 
 
 def beats(mine: Any, base: Any) -> Any:
-    """1 where a policy is better (lower) than its base, one half in a tie, else 0."""
+    """Return 1 where a policy is better (lower) than its base, one half in a tie, otherwise 0."""
     return (mine < base) + 0.5 * (mine == base)
-
-
-def over_seeds(values: Sequence[float] | Array) -> Estimate:
-    """Interquartile mean over training seeds with its 95 % percentile bootstrap interval.
-
-    Args:
-        values: One per training seed; those that are nan have no figure and are left out.
-    """
-    found = np.asarray(values, dtype=np.float64)
-    return estimate(lambda _: found[None], ())
 
 
 def improvement(won: Sequence[Array], played: Sequence[Array]) -> Estimate:
@@ -143,26 +125,26 @@ def improvement(won: Sequence[Array], played: Sequence[Array]) -> Estimate:
 
     Args:
         won: Pairs of episodes in which the policy is better, (seeds, robots) for every cell.
-        played: Pairs of episodes, likewise.
+        played: All pairs of episodes, likewise.
 
     Returns:
-        Share of all pairs of training seed and episode, with an interval. As in `change`, seeds
-        count that have pairs in every cell.
+        Share of all pairs of training seed and episode, with an interval. As in `change`, only
+        seeds with pairs in every cell count.
     """
-    whole = np.all([own.sum(axis=1) > 0 for own in played], axis=0)
+    is_complete = np.all([cell.sum(axis=1) > 0 for cell in played], axis=0)
 
-    def figures(counts: Counts) -> Array:
+    def sums(counts: Counts) -> Array:
         parts = [
-            sum(count @ own.T for count, own in zip(counts, cells, strict=True))
+            sum(count @ cell.T for count, cell in zip(counts, cells, strict=True))
             for cells in (won, played)
         ]
-        return np.where(whole, np.array(parts), np.nan)
+        return np.where(is_complete, np.array(parts), np.nan)
 
-    return estimate(figures, [own.shape[1] for own in played], _share)
+    return estimate(sums, [cell.shape[1] for cell in played], _won_share)
 
 
-def _share(parts: Array, axis: int = -1) -> Any:
-    """Won over played pairs, of (2, ..., seeds); nan without one."""
+def _won_share(parts: Array, axis: int = -1) -> Any:
+    """Won over played pairs, from their numbers (2, ..., seeds); nan without a pair."""
     won, played = parts.sum(axis=axis)
     return won / np.where(played > 0.0, played, np.nan)
 
@@ -170,7 +152,7 @@ def _share(parts: Array, axis: int = -1) -> Any:
 def mean_of_robots(values: Array, counts: Array) -> Array:
     """Means over robots in resamples, (seeds, robots) to (resamples, seeds).
 
-    Robots that are nan have no figure and are left out; a mean of none is nan.
+    Robots that are nan are left out; the mean of no robot is nan.
     """
     is_known = np.isfinite(values)
     total = counts @ np.where(is_known, values, 0.0).T
@@ -179,20 +161,20 @@ def mean_of_robots(values: Array, counts: Array) -> Array:
 
 
 Part: TypeAlias = Callable[[Array], tuple[Array, Array]]
-"""Of a sorted sample of n values, how many lie below the part that counts, and where it ends."""
+"""Number of values below the part that counts, and up to its end, in a sorted sample of n."""
 
 
 def middle_half(n: Array) -> tuple[Array, Array]:
     """The part of `interquartile_mean`."""
-    cut = np.floor(_CUT * n)
-    return cut, n - cut
+    trimmed = np.floor(_TRIMMED_SHARE * n)
+    return trimmed, n - trimmed
 
 
 def worst_share(n: Array) -> tuple[Array, Array]:
     """The highest tenth, whose mean is the CVaR [Rockafellar2000].
 
-    The value at the edge counts in part, so that 32 values have a worst tenth of 3.2. A tenth of
-    fewer than ten is the highest.
+    The value at the edge counts in part: the worst tenth of 32 values has 3.2 values. The worst
+    tenth of fewer than ten values is the highest value.
 
     [Rockafellar2000] R. T. Rockafellar, S. Uryasev, "Optimization of Conditional Value-at-Risk", J.
     Risk 2(3).
@@ -201,15 +183,15 @@ def worst_share(n: Array) -> tuple[Array, Array]:
 
 
 def middle(n: Array) -> tuple[Array, Array]:
-    """The part of the median: the value in the middle, or half of each of the two there."""
+    """The part of the median: the middle value, or half of each of the two middle values."""
     return (n - 1.0) / 2.0, (n + 1.0) / 2.0
 
 
 def mean_of_part(part: Part) -> Callable[[Array, Array], Array]:
-    """A mean over a part of the robots, from the best to the worst; as `mean_of_robots`."""
+    """Return a function as `mean_of_robots` for the mean over a part of the sorted robots."""
 
     def mean(values: Array, counts: Array) -> Array:
-        return np.stack([_mean_of_part(own, counts, part) for own in values], axis=-1)
+        return np.stack([_mean_of_part(seed, counts, part) for seed in values], axis=-1)
 
     return mean
 
@@ -220,13 +202,13 @@ def _mean_of_part(values: Array, counts: Array, part: Part) -> Array:
     order = np.argsort(values)[: len(known)]
     if not len(known):
         return np.full(len(counts), np.nan)
-    own = counts[:, order]
-    above = own.cumsum(axis=1)
-    low, high = part(above[:, -1:])
-    counted = np.minimum(above, high) - np.maximum(above - own, low)
-    share = np.where(above[:, -1:] > 0.0, high - low, 0.0)
-    total = np.maximum(counted, 0.0) @ known
-    return total / np.where(share > 0.0, share, np.nan)[:, 0]
+    sorted_counts = counts[:, order]
+    ends = sorted_counts.cumsum(axis=1)
+    low, high = part(ends[:, -1:])
+    weights = np.minimum(ends, high) - np.maximum(ends - sorted_counts, low)
+    size = np.where(ends[:, -1:] > 0.0, high - low, 0.0)
+    total = np.maximum(weights, 0.0) @ known
+    return total / np.where(size > 0.0, size, np.nan)[:, 0]
 
 
 def estimate(
@@ -234,15 +216,15 @@ def estimate(
     robots: Sequence[int],
     combine: Callable[..., Any] = interquartile_mean,
 ) -> Estimate:
-    """A figure with its 95 % percentile bootstrap interval over training seeds and robots.
+    """An estimate with its 95 % percentile bootstrap interval over training seeds and robots.
 
-    With training seeds alone it is the one of `scipy.stats.bootstrap`, bit for bit.
+    Without robots the interval is that of `scipy.stats.bootstrap`, bit for bit.
 
     Args:
-        figures: Figures of every seed in resamples of the robots, (..., resamples or 1, seeds);
+        figures: Values of every seed in resamples of the robots, (..., resamples or 1, seeds);
             seeds that are nan with all robots are left out.
-        robots: Robots of every cell; 1 where none is drawn.
-        combine: A figure over seeds, the last axis.
+        robots: Number of robots of every cell; 1 if none is drawn.
+        combine: Statistic over seeds, the last axis.
     """
     once = np.asarray(figures([np.ones((1, number)) for number in robots]))
     values = once.reshape(math.prod(once.shape[:-1]), once.shape[-1])
@@ -257,34 +239,33 @@ def estimate(
     if seeds < 2 and not drawn:
         return Estimate(value)
     chosen, counts = _resamples(seeds, tuple(robots))
-    found = np.asarray(figures(counts) if drawn else once)[..., order]
-    found = np.broadcast_to(found, (*found.shape[:-2], len(chosen), seeds))
-    chosen = np.broadcast_to(chosen, found.shape)
-    replicates = combine(np.take_along_axis(found, chosen, axis=-1), axis=-1)
+    resampled = np.asarray(figures(counts) if drawn else once)[..., order]
+    resampled = np.broadcast_to(resampled, (*resampled.shape[:-2], len(chosen), seeds))
+    chosen = np.broadcast_to(chosen, resampled.shape)
+    replicates = combine(np.take_along_axis(resampled, chosen, axis=-1), axis=-1)
     tail = (1.0 - CONFIDENCE) / 2.0
     tails = 100.0 * np.array([tail, 1.0 - tail])
     low, high = np.percentile(replicates[np.isfinite(replicates)], tails)
-    is_of_seeds = seeds > 1
-    return Estimate(value, float(low), float(high), seeds if is_of_seeds else 0, drawn)
+    return Estimate(value, float(low), float(high), seeds if seeds > 1 else 0, drawn)
 
 
 def named_intervals(estimates: Iterable[Estimate]) -> str:
-    """What the intervals of some figures are over, such as "95 % over 64 robots"; empty if none."""
-    over = dict.fromkeys(own.over for own in estimates if own.over)
+    """Confidence and units of intervals, such as "95 % over 64 robots"; empty without any."""
+    over = dict.fromkeys(estimate.over for estimate in estimates if estimate.over)
     return f"{100.0 * CONFIDENCE:g} % over {', or '.join(over)}" if over else ""
 
 
 @lru_cache(maxsize=8)
 def _resamples(seeds: int, robots: tuple[int, ...]) -> tuple[IntArray, list[Array]]:
-    """Seeds of every resample, and how often it has each robot of every cell; always the same."""
+    """Seeds of every resample, and its counts of the robots of every cell; always the same."""
     rng = np.random.default_rng(_BOOTSTRAP_SEED)
     resamples = min(RESAMPLES, MOST_DRAWS // max(robots, default=1))
     chosen = rng.integers(0, seeds, (resamples, seeds))
-    return chosen, [_drawn_counts(rng, resamples, number) for number in robots]
+    return chosen, [_draw_counts(rng, resamples, number) for number in robots]
 
 
-def _drawn_counts(rng: np.random.Generator, resamples: int, number: int) -> Array:
-    """How often each of some units is drawn in as many draws, (resamples, number)."""
+def _draw_counts(rng: np.random.Generator, resamples: int, number: int) -> Array:
+    """Draw as many units as there are, with replacement; count each unit, (resamples, number)."""
     if number == 1:
         return np.ones((resamples, 1))
     drawn = rng.integers(0, number, (resamples, number))

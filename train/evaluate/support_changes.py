@@ -1,16 +1,16 @@
 r"""Errors of a policy's local frame where the support foot changes, against the truth.
 
-The local frame of a walking controller stands at the sole of the support foot, where joint angles
-and IMU put it (section II.B of the paper). With elastic joints it is off by the vector e; for a
-deflection δ of the hip roll joint alone (the paper's θ), with leg length L, that is Eq. 1:
+The local frame of a walking controller has its origin at the sole of the support foot. Joint angles
+and IMU give its place (section II.B of the paper). With elastic joints it is off by the vector e.
+For a deflection δ of the hip roll joint alone (the paper's θ) and the leg length L, Eq. 1 gives
 
 .. math:: e = L \, [0, \; 2 \sin(δ/2) \cos(δ/2), \; 2 \sin²(δ/2)]
 
-Where the support foot changes, the frame is taken anew from the other foot, and the estimated
-center of mass jumps.
+When the support foot changes, the frame moves to the other foot, and the estimated center of mass
+jumps.
 
-Axes are level and have the heading of the pelvis, which no sensor of the robot shows. The footholds
-are those of the plan in its local frame (`elastic_env.motion.walk_plan`).
+Axes are level and have the heading of the pelvis, which no sensor of the robot measures. The
+footholds are those of the plan in its local frame (`elastic_env.motion.walk_plan`).
 """
 
 from typing import Any
@@ -24,7 +24,7 @@ from elastic_env.world.robot_model import WalkerModel
 
 
 def support_changes(timing: Timing) -> IntArray:
-    """Scored control steps at which the support foot is another than a control step before."""
+    """Scored control steps at which the support foot differs from the control step before."""
     changed = np.zeros(len(timing.support), dtype=np.bool_)
     changed[1:] = timing.support[1:] != timing.support[:-1]
     return np.flatnonzero(changed & timing.scored)
@@ -37,7 +37,7 @@ def tilt(R: Array) -> Array:
 
 
 def frame_error(estimate: LocalFrame, true: LocalFrame, foot: int) -> Array:
-    """e: the place of a foot's sole by the estimate, minus the true one, (num_worlds, 3) [m]."""
+    """Estimated minus true place of a foot's sole, the vector e, (num_worlds, 3) [m]."""
     return estimate.soles[:, foot] - true.soles[:, foot]
 
 
@@ -46,19 +46,19 @@ def com_jump(estimate: LocalFrame, footholds: Array, old: int, new: int) -> Arra
 
     Args:
         estimate: Local frame by the policy's joint angles.
-        footholds: Planned middles of the soles, on which the frame stands, (2, 2) [m].
-        old: Support foot before.
-        new: Support foot after.
+        footholds: Planned middles of the soles in the plan's local frame, (2, 2) [m].
+        old: Support foot before the change.
+        new: Support foot after it.
     """
     com = estimate.com[:, None] - estimate.soles + np.pad(footholds, ((0, 0), (0, 1)))
     return com[:, new] - com[:, old]
 
 
 class SupportChanges:
-    """Errors of the local frame in many worlds that walk in step, taken at every support change.
+    """Errors of the local frame at every support change, in many worlds that walk in step.
 
     Args:
-        model: The walker as it is assumed.
+        model: The assumed walker.
     """
 
     def __init__(self, model: WalkerModel) -> None:
@@ -70,18 +70,18 @@ class SupportChanges:
         self._errors: list[Array] = []
         self._jumps: list[Array] = []
 
-    def take(self, step: int, q_estimate: Array, seen: Array, truth: Any) -> None:
-        """Take a control step.
+    def record(self, step: int, q_estimate: Array, observation: Array, truth: Any) -> None:
+        """Record a control step.
 
         Args:
             step: Its number, 0 at the start of the episodes.
-            q_estimate: Joint angles as the policy sees them, (num_worlds, 12) [rad].
-            seen: Its observation, (num_worlds, m).
+            q_estimate: Joint angles that the policy estimates, (num_worlds, 12) [rad].
+            observation: Observation of the policy, (num_worlds, m).
             truth: True state at that time, an `elastic_env.robots.thormang.records.WalkTruth`.
         """
         if step not in self._changes:
             return
-        estimate = local_frame(self._biped, q_estimate, seen[:, self._attitude])
+        estimate = local_frame(self._biped, q_estimate, observation[:, self._attitude])
         true = local_frame(self._biped, truth.q, tilt(truth.pelvis_R))
         old = int(self._support[step - 1])
         new = int(self._support[step])
@@ -89,7 +89,7 @@ class SupportChanges:
         self._jumps.append(com_jump(estimate, self._soles[step], old, new))
 
     def metrics(self, world: int) -> dict[str, float]:
-        """Figures of a world over its support changes so far; none without a change."""
+        """Metrics of a world over its support changes so far; none without a change."""
         if not self._errors:
             return {}
         errors = np.array([error[world] for error in self._errors])

@@ -1,7 +1,7 @@
-"""A compensator of live robots as a header in C99, its test vector, and an example.
+"""A `PositionCompensator` as a header in C99, with its test vector and an example.
 
-The header loops over tables of constants. It computes what `PositionCompensator` does, by the
-same formulas in the same order, so that both agree to rounding.
+The header loops over tables of constants. It uses the formulas of `PositionCompensator` in the same
+order, so that both agree up to rounding.
 """
 
 import contextlib
@@ -23,20 +23,20 @@ from train.export.c_text import (
     GENERATED,
     comment,
     enum_lines,
-    fill,
+    fill_template,
     identifier,
-    members,
+    member_values,
     number,
     number_list,
     numbers,
-    plain,
+    plain_text,
     row_lines,
-    unique,
+    unique_names,
 )
 
 _TEST_STEPS = 12
 _LOADED_STEP = 6
-"""Step of the test vector from which on the tip carries a payload."""
+"""First step of the test vector in which the tip carries a payload."""
 _PAYLOAD_KG = 0.3
 _PAYLOAD_AT = (0.01, -0.02, 0.05)
 _TEST_RATE = 0.5
@@ -48,10 +48,10 @@ class Frame:
     """A body or site that can carry a payload.
 
     Attributes:
-        name: In C, behind the prefix.
+        name: Name in C, after the prefix.
         body: Number of the body in MuJoCo's model.
         link: Link that it moves with.
-        place, R: In the frame of that link, (3,) [m], (3, 3).
+        place, R: Origin and axes in the frame of that link, (3,) [m], (3, 3).
     """
 
     name: str
@@ -66,15 +66,15 @@ def c_header(
 ) -> str:
     """The header of a compensator, with a test vector behind the macro <PREFIX>_TEST.
 
-    The compensator is played for the test vector: it begins anew, and ends so.
+    The compensator plays the test vector: it is reset before and after.
 
     Args:
-        compensator: What the header computes.
-        prefix: Of all names in the header.
-        sources: Contents of the files that the compensator was made of, by name, for their digests.
+        compensator: Compensator that the header computes.
+        prefix: Prefix of all names in the header.
+        sources: Contents of the files that define the compensator, by name, for their digests.
 
     Raises:
-        ConfigurationError: The prefix is none.
+        ConfigurationError: The prefix is invalid.
     """
     names = compensator.joints
     constants = compensator.constants
@@ -82,39 +82,39 @@ def c_header(
     tables = _tables(constants, frames)
     digest = sha256("\n".join(tables.values()).encode()).hexdigest()
     capitals = prefix.upper()
-    return fill(
+    return fill_template(
         "arm.h.in",
         prefix,
         **tables,
-        vectors=fill("common_vectors.h.in", prefix),
+        vectors=fill_template("common_vectors.h.in", prefix),
         digest=digest,
         origin=comment(_origin_lines(sources or {})),
         joints=comment(_joint_lines(names, constants)),
-        joint_names=enum_lines(unique(f"{capitals}_JOINT_", names)),
+        joint_names=enum_lines(unique_names(f"{capitals}_JOINT_", names)),
         frame_names=enum_lines(f"{capitals}_{frame.name}" for frame in frames),
         test=_test_vector(compensator, prefix),
     )
 
 
 def payload_frames(constants: CompensatorConstants) -> list[Frame]:
-    """Bodies and sites with names that joints move; the body of the last joint first."""
+    """Bodies and sites with names that joints move, the body of the last joint first."""
     model = constants.model
     tree = constants.body.tree
     bodies = [b for b in range(model.nbody) if tree.carrier[b] > 0]
-    named = [(b, model.body(b).name) for b in bodies if model.body(b).name]
-    found: list[tuple[str, int, Array, Array]] = [
+    body_names = {model.body(b).name: b for b in bodies if model.body(b).name}
+    candidates: list[tuple[str, int, Array, Array]] = [
         ("TIP", constants.tip, np.zeros(3), np.eye(3)),
+        *((f"BODY_{identifier(n)}", b, np.zeros(3), np.eye(3)) for n, b in body_names.items()),
     ]
-    found += [(f"BODY_{identifier(name)}", b, np.zeros(3), np.eye(3)) for b, name in named]
-    taken = {name for _, name in named}
     for i in range(model.nsite):
         site = model.site(i)
         body = int(site.bodyid[0])
-        if body in bodies and site.name and site.name not in taken:
-            found.append((f"SITE_{identifier(site.name)}", body, site.pos, matrix_of(site.quat)))
-    names = unique("", [name for name, *_ in found])
+        if body in bodies and site.name and site.name not in body_names:
+            name = f"SITE_{identifier(site.name)}"
+            candidates.append((name, body, site.pos, matrix_of(site.quat)))
+    names = unique_names("", [name for name, *_ in candidates])
     frames: list[Frame] = []
-    for name, (_, body, place, R) in zip(names, found, strict=True):
+    for name, (_, body, place, R) in zip(names, candidates, strict=True):
         R_lb = tree.R[body]
         in_link = tree.place[body] + R_lb @ place
         frames.append(Frame(name, body, tree.carrier[body], in_link, R_lb @ R))
@@ -122,19 +122,19 @@ def payload_frames(constants: CompensatorConstants) -> list[Frame]:
 
 
 def _tables(constants: CompensatorConstants, frames: Sequence[Frame]) -> dict[str, str]:
-    """All that is computed with, as text in C."""
+    """Constants of the compensator, as text in C."""
     body = constants.body
     n = len(constants.compliance)
-    none = np.zeros(n)
-    friction = constants.friction or FrictionCompensation(none, none, none, none)
+    zeros = np.zeros(n)
+    friction = constants.friction or FrictionCompensation(zeros, zeros, zeros, zeros)
     rows = {"gravity": constants.model.opt.gravity}
-    for owner, names in (
+    for source, names in (
         (constants, "compliance of_command lowest highest"),
         (body, "spring spring_rest"),
         (constants, "viscous lag_s fastest rotor_s2"),
         (friction, "coulomb load_ratio static stribeck_speed dead_zone"),
     ):
-        rows |= {name: getattr(owner, name) for name in names.split()}
+        rows |= {name: getattr(source, name) for name in names.split()}
     return {
         "n": str(n),
         "num_frames": str(len(frames)),
@@ -143,25 +143,25 @@ def _tables(constants: CompensatorConstants, frames: Sequence[Frame]) -> dict[st
         "limit_rad": number(constants.limit_rad),
         "period_s": number(constants.period_s),
         "presliding_rad": number(PRESLIDING_RAD),
-        "links": ",\n".join(_link(row) for row in body.tree.links[1:]),
+        "links": ",\n".join(map(_link_text, body.tree.links[1:])),
         "frames": ",\n".join(
-            f"    {{{one.body}, {one.link}, {number_list(one.place)}, {number_list(one.R)}}}"
-            for one in frames
+            f"    {{{f.body}, {f.link}, {number_list(f.place)}, {number_list(f.R)}}}"
+            for f in frames
         ),
         **{name: numbers(values) for name, values in rows.items()},
     }
 
 
-def _link(row: Any) -> str:
-    masses = members(row, "mass mass_moment inertia weight weight_moment")
-    place = f"{row['parent']}, {row['column']}, {members(row, 'zero R anchor')}"
+def _link_text(row: Any) -> str:
+    masses = member_values(row, "mass mass_moment inertia weight weight_moment")
+    place = f"{row['parent']}, {row['column']}, {member_values(row, 'zero R anchor')}"
     return f"    {{{place},\n     {{{masses}}}}}"
 
 
 def _origin_lines(sources: Mapping[str, bytes]) -> Iterator[str]:
     yield GENERATED
     for name, content in sources.items():
-        yield f"  {plain(name)}, SHA-256 {sha256(content).hexdigest()}"
+        yield f"  {plain_text(name)}, SHA-256 {sha256(content).hexdigest()}"
 
 
 def _joint_lines(names: Sequence[str], constants: CompensatorConstants) -> Iterator[str]:
@@ -169,9 +169,9 @@ def _joint_lines(names: Sequence[str], constants: CompensatorConstants) -> Itera
         K = 1.0 / constants.compliance
         gain = 1.0 / (constants.of_command - constants.compliance)
     for j, name in enumerate(names):
-        ends = f"{constants.lowest[j]:.4g} to {constants.highest[j]:.4g} rad"
+        bounds = f"{constants.lowest[j]:.4g} to {constants.highest[j]:.4g} rad"
         servo = "" if np.isinf(gain[j]) else f", k_p {gain[j]:.6g} N*m/rad"
-        yield f"  {j}  {plain(name)}: K {K[j]:.6g} N*m/rad{servo}, {ends}"
+        yield f"  {j}  {plain_text(name)}: K {K[j]:.6g} N*m/rad{servo}, {bounds}"
 
 
 def _test_vector(compensator: PositionCompensator, prefix: str) -> str:
@@ -184,10 +184,10 @@ def _test_vector(compensator: PositionCompensator, prefix: str) -> str:
     q = generator.uniform(lowest, highest, shape)
     rates = generator.uniform(-_TEST_RATE, _TEST_RATE, (2, *shape))
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # nobody commands these poses
+        warnings.simplefilter("ignore")  # no robot goes to these poses
         command, link_angle = _play(compensator, q, rates)
     motion = np.stack([q, *rates], axis=1)
-    return fill(
+    return fill_template(
         "arm_test.h.in",
         prefix,
         steps=_TEST_STEPS,
@@ -200,7 +200,13 @@ def _test_vector(compensator: PositionCompensator, prefix: str) -> str:
 
 
 def _play(compensator: PositionCompensator, q: Array, rates: Array) -> tuple[Array, Array]:
-    """Commands along a motion, (T, n) and (2, T, n), and link angles where encoders show them."""
+    """Play a motion; return commands, and link angles if the encoders were at the commands.
+
+    Args:
+        compensator: Compensator that plays it.
+        q: Desired link angles, (T, n) [rad].
+        rates: Their rates and accelerations, (2, T, n) [rad/s], [rad/s²].
+    """
     command = np.empty(q.shape)
     link_angle = np.full(q.shape, np.nan)
     compensator.reset()
@@ -208,7 +214,7 @@ def _play(compensator: PositionCompensator, q: Array, rates: Array) -> tuple[Arr
         if step == _LOADED_STEP:
             compensator.set_payload(_PAYLOAD_KG, _PAYLOAD_AT)
         command[step] = compensator.command(q[step], *rates[:, step])
-        with contextlib.suppress(ElasticError):  # NaN stands for a call that has to fail
+        with contextlib.suppress(ElasticError):  # nan means that the call must fail
             link_angle[step] = compensator.link_angle(command[step])
     compensator.reset()
     return command, link_angle

@@ -11,13 +11,13 @@ from train.export.c_text import (
     GENERATED,
     comment,
     enum_lines,
-    fill,
+    fill_template,
     number,
     number_list,
     numbers,
-    plain,
+    plain_text,
     row_lines,
-    unique,
+    unique_names,
 )
 from train.export.residual_layout import ResidualLayout
 
@@ -30,19 +30,19 @@ def c_residual(layout: ResidualLayout, prefix: str) -> str:
     """The header of a residual, with a test vector behind the macro <PREFIX>_TEST.
 
     Args:
-        layout: What it computes.
-        prefix: Of all names in the header.
+        layout: Layout of the residual.
+        prefix: Prefix of all names in the header.
 
     Raises:
-        ConfigurationError: The prefix is none.
+        ConfigurationError: The prefix is invalid.
     """
     facts = layout.facts()
     settings = layout.description.settings
     widths = [len(layout.tensors[f"bias{i}"]) for i in range(layout.num_layers)]
-    of_features, of_residual = layout.mirrors or (None, None)
-    drawn = layout.draw(_TEST_ROWS)
-    decided, _ = layout.decide(**drawn)
-    return fill(
+    feature_mirror, residual_mirror = layout.mirrors or (None, None)
+    samples = layout.draw(_TEST_ROWS)
+    decided, _ = layout.decide(**samples)
+    return fill_template(
         "residual.h.in",
         prefix,
         weights_sha256=layout.weights_sha256,
@@ -57,43 +57,44 @@ def c_residual(layout: ResidualLayout, prefix: str) -> str:
         decision_period=settings.decision_period,
         has_mirror=int(layout.mirrors is not None),
         column_names=enum_lines(
-            unique(f"{prefix.upper()}_", [signal.name for signal in layout.columns])
+            unique_names(f"{prefix.upper()}_", [signal.name for signal in layout.columns])
         ),
         mean=numbers(layout.tensors["mean"].astype(np.float64)),
         std=numbers(layout.tensors["std"].astype(np.float64)),
         bounds=numbers(layout.bounds),
         source=", ".join(map(str, layout.source)),
-        of_features=_mirror(of_features, len(layout.features)),
-        of_residual=_mirror(of_residual, len(layout.residual)),
-        layers="\n".join(_layers(layout, prefix)),
-        calls="\n".join(_calls(layout, prefix, widths)),
+        of_features=_mirror_rows(feature_mirror, len(layout.features)),
+        of_residual=_mirror_rows(residual_mirror, len(layout.residual)),
+        layers="\n".join(_layer_tables(layout, prefix)),
+        calls="\n".join(_layer_calls(layout, prefix, widths)),
         activation=_ACTIVATIONS[layout.description.activation],
-        output=_output(layout, prefix),
+        output=_output_expression(layout, prefix),
         clip=number(layout.description.clip),
         share=number(facts["share_per_control_step"]),
         rows=_TEST_ROWS,
-        test_features=row_lines(drawn["features"]),
-        test_foot=numbers(drawn["on_right"]),
+        test_features=row_lines(samples["features"]),
+        test_foot=numbers(samples["on_right"]),
         test_decided=row_lines(decided),
     )
 
 
 def _origin_lines(facts: dict[str, Any]) -> Iterator[str]:
     yield GENERATED
-    joints = ", ".join(map(plain, facts["joints"])) or "those of the robot"
-    yield f"  {plain(facts['name'])}, on {plain(facts['base'])} of the {plain(facts['robot'])}"
+    joints = ", ".join(map(plain_text, facts["joints"])) or "those of the robot"
+    name, base, robot = (plain_text(facts[key]) for key in ("name", "base", "robot"))
+    yield f"  {name}, on {base} of the {robot}"
     yield f"  joints: {joints}"
 
 
 def _column_lines(columns: list[dict[str, Any]]) -> Iterator[str]:
-    for number_, column in enumerate(columns):
+    for index, column in enumerate(columns):
         bound = f", within {column['bound']:g}" if "bound" in column else ""
-        unit = plain(column["unit"].replace("·", " ").replace("²", "^2"))
-        yield f"  {number_:3}  {plain(column['name'])} [{unit}]{bound}"
+        unit = plain_text(column["unit"].replace("·", " ").replace("²", "^2"))
+        yield f"  {index:3}  {plain_text(column['name'])} [{unit}]{bound}"
 
 
-def _mirror(mirror: Mirror | None, count: int) -> str:
-    """Rows of a mirror's table; of none a table that is never read."""
+def _mirror_rows(mirror: Mirror | None, count: int) -> str:
+    """Rows of a mirror's table; without a mirror a table that is never read."""
     if mirror is None:
         return ", ".join(["{0, 1.0, 0.0}"] * count)
     rows = zip(mirror.source, mirror.sign, mirror.offset, strict=True)
@@ -102,8 +103,8 @@ def _mirror(mirror: Mirror | None, count: int) -> str:
     )
 
 
-def _layers(layout: ResidualLayout, prefix: str) -> Iterator[str]:
-    """Tables of the weights, a row per input, and of the biases."""
+def _layer_tables(layout: ResidualLayout, prefix: str) -> Iterator[str]:
+    """Yield tables of the weights, a row per input, and of the biases."""
     for i in range(layout.num_layers):
         W: Array = np.ascontiguousarray(layout.tensors[f"weight{i}"].astype(np.float32).T)
         bias: Array = layout.tensors[f"bias{i}"].astype(np.float32)
@@ -112,23 +113,23 @@ def _layers(layout: ResidualLayout, prefix: str) -> Iterator[str]:
         yield f"static const float {prefix}_bias{i}_[{bias.size}] = {number_list(bias)};"
 
 
-def _calls(layout: ResidualLayout, prefix: str, widths: list[int]) -> Iterator[str]:
-    """The layers, from x to y and back."""
-    given = [len(layout.features), *widths]
+def _layer_calls(layout: ResidualLayout, prefix: str, widths: list[int]) -> Iterator[str]:
+    """Yield the calls of the layers, from buffer x to y and back."""
+    sizes = [len(layout.features), *widths]
     for i in range(layout.num_layers):
         source, target = _buffers(i)
-        tables = f"{given[i]}, {prefix}_weight{i}_, {prefix}_bias{i}_, {given[i + 1]}"
+        tables = f"{sizes[i]}, {prefix}_weight{i}_, {prefix}_bias{i}_, {sizes[i + 1]}"
         yield f"    {prefix}_affine_({source}, {tables}, {target});"
         if i < layout.num_layers - 1:
-            yield f"    {prefix}_activate_({target}, {given[i + 1]});"
+            yield f"    {prefix}_activate_({target}, {sizes[i + 1]});"
 
 
-def _output(layout: ResidualLayout, prefix: str) -> str:
+def _output_expression(layout: ResidualLayout, prefix: str) -> str:
     _, last = _buffers(layout.num_layers - 1)
     output = _OUTPUTS[layout.description.output].format(f"{last}[k]")
     return output.replace("residual_", f"{prefix}_")
 
 
 def _buffers(layer: int) -> tuple[str, str]:
-    """Where a layer reads, and where it writes."""
+    """Buffers that a layer reads from and writes to."""
     return ("x", "y") if layer % 2 == 0 else ("y", "x")

@@ -1,4 +1,4 @@
-"""Numbers, names and comments of C, and the templates of what is exported."""
+"""Numbers, names and comments in C, and the templates of exported files."""
 
 import re
 from collections.abc import Iterable
@@ -19,10 +19,10 @@ _LONGEST_PREFIX = 40
 
 
 def require_prefix(prefix: str) -> str:
-    """A prefix of names in C.
+    """Check a prefix of names in C, and return it.
 
     Raises:
-        ConfigurationError: It is none.
+        ConfigurationError: It is invalid.
     """
     if len(prefix) > _LONGEST_PREFIX or not _PREFIX.fullmatch(prefix):
         raise ConfigurationError(
@@ -33,20 +33,20 @@ def require_prefix(prefix: str) -> str:
 
 
 def prefix_of(name: str) -> str:
-    """A prefix from the name of a robot or file; `robot` where nothing of it fits."""
+    """A prefix from the name of a robot or file; `robot` if no character is allowed."""
     return identifier(name).lower().lstrip("_0123456789")[:_LONGEST_PREFIX] or "robot"
 
 
-def fill(template: str, prefix: str, **parts: Any) -> str:
-    """A file of a template, with the prefix in the place of its first word.
+def fill_template(template: str, prefix: str, **parts: Any) -> str:
+    """Fill a template, with the prefix instead of its first word.
 
     Args:
-        template: Its name, such as arm_main.c.in, in which `arm_` is the prefix.
-        prefix: Of all names.
-        **parts: Texts in the place of ${name}; that of ${version} is known.
+        template: Name of its file, such as arm_main.c.in, in which `arm_` is the prefix.
+        prefix: Prefix of all names.
+        **parts: Texts for ${name}; ${version} is added.
 
     Raises:
-        ConfigurationError: The prefix is none.
+        ConfigurationError: The prefix is invalid.
     """
     require_prefix(prefix)
     word = re.split(r"[_.]", template)[0]
@@ -57,21 +57,21 @@ def fill(template: str, prefix: str, **parts: Any) -> str:
 
 
 def c_example(program: str, prefix: str, header: str) -> dict[str, str]:
-    """Contents of a program that checks a header and times it, and of its CMakeLists, by name.
+    """Contents of a program that checks and times a header, and of its CMakeLists, by file name.
 
     Args:
-        program: What the header has: arm, residual or walker.
-        prefix: Of the header's names.
-        header: Its file, as the program includes it.
+        program: Kind of the header: arm, residual or walker.
+        prefix: Prefix of the header's names.
+        header: File of the header, as the program includes it.
     """
     return {
-        f"{prefix}_main.c": fill(f"{program}_main.c.in", prefix, header=header),
-        "CMakeLists.txt": fill("arm_CMakeLists.txt.in", prefix),
+        f"{prefix}_main.c": fill_template(f"{program}_main.c.in", prefix, header=header),
+        "CMakeLists.txt": fill_template("arm_CMakeLists.txt.in", prefix),
     }
 
 
 def number(value: Any) -> str:
-    """A double, or a float of NumPy as one, read back bit for bit."""
+    """Text of a double, or of a float of NumPy, which C reads back bit for bit."""
     if np.isnan(value):
         return "NAN"
     if np.isinf(value):
@@ -81,49 +81,49 @@ def number(value: Any) -> str:
 
 
 def numbers(values: Any) -> str:
-    """Numbers of a list, without its braces."""
+    """Text of numbers with commas, without braces."""
     return ", ".join(map(number, np.ravel(values)))
 
 
 def number_list(values: Any) -> str:
-    """Numbers of a list."""
+    """Text of numbers in braces."""
     return f"{{{numbers(values)}}}"
 
 
-def members(row: Any, names: str) -> str:
-    """Members of a struct, numbers and flat lists of them; their names are parted by spaces."""
+def member_values(row: Any, names: str) -> str:
+    """Text of the members of a struct, numbers and flat lists; spaces separate their names."""
     values = [row[name] for name in names.split()]
-    return ", ".join(number(own) if np.ndim(own) == 0 else number_list(own) for own in values)
+    return ", ".join(number(v) if np.ndim(v) == 0 else number_list(v) for v in values)
 
 
 def row_lines(values: Array) -> str:
-    """Rows of an array of two or more axes, a row of the first on a line."""
+    """Text of an array of two or more axes, a row of the first axis on a line."""
     return ",\n".join(f"    {initialiser(row)}" for row in values)
 
 
 def initialiser(value: Any) -> str:
-    """A number, or an array as lists within lists; whole numbers stay whole."""
+    """Text of a number, or of an array as nested lists; integers stay integers."""
     if np.ndim(value) == 0:
         return str(value) if isinstance(value, np.integer) else number(value)
     return "{" + ", ".join(map(initialiser, value)) + "}"
 
 
 def enum_lines(names: Iterable[str]) -> str:
-    """Names of an enumeration, a line each."""
+    """Text of the names of an enumeration, a line each."""
     return ",\n".join(f"    {name}" for name in names)
 
 
-def unique(start: str, names: Iterable[str]) -> list[str]:
-    """Identifiers in capitals, numbered where two would be the same."""
-    found: list[str] = []
+def unique_names(prefix: str, names: Iterable[str]) -> list[str]:
+    """Identifiers in capitals, numbered if two would be the same."""
+    result: list[str] = []
     for name in names:
-        whole = stem = start + identifier(name).upper()
+        unique = stem = prefix + identifier(name).upper()
         count = 2
-        while whole in found:
-            whole = f"{stem}_{count}"
+        while unique in result:
+            unique = f"{stem}_{count}"
             count += 1
-        found.append(whole)
-    return found
+        result.append(unique)
+    return result
 
 
 def identifier(name: str) -> str:
@@ -132,10 +132,10 @@ def identifier(name: str) -> str:
 
 
 def comment(lines: Iterable[str]) -> str:
-    """Lines within a comment."""
+    """Text of lines within a comment."""
     return "\n".join(f" * {line}".rstrip() for line in lines)
 
 
-def plain(name: str) -> str:
-    """A user's name for a comment: it cannot end the comment, and is in ASCII."""
+def plain_text(name: str) -> str:
+    """A user's name for a comment, in ASCII and without the end of a comment."""
     return re.sub(r"[^A-Za-z0-9 _.,:+=()@^/-]", "_", name)

@@ -1,9 +1,9 @@
-"""Residuals on the Hugging Face hub: two files and a card, as data alone.
+"""Residuals on the Hugging Face hub: two data files and a card.
 
-A repository is a model's, with `residual.json` and `weights.safetensors` at its top. What comes
-from there is untrusted: names, sizes and kinds are known before anything is fetched, nothing of it
-is run or unpickled, and the digest of the weights must be that of the description. Everything else
-in a repository is left there.
+A repository of type model has `residual.json` and `weights.safetensors` at its top. Its files are
+untrusted. Names, sizes and types are checked before a download. Nothing is executed or unpickled,
+and the digest of the weights must be that of the description. Other files of a repository are not
+downloaded.
 """
 
 import os
@@ -28,10 +28,10 @@ from elastic_env.core.files import read_bounded, write_whole
 from train.runs.folders import result_folder
 
 HUB = Path("hub")
-"""Folder of residuals that were pulled, in the working folder."""
+"""Folder for pulled residuals, in the working folder."""
 _MOST_BYTES = {DESCRIPTION: 4_000_000, WEIGHTS: 100_000_000}
 _ENDPOINT = "HF_ENDPOINT"
-_PATIENCE_S = 10.0
+_TIMEOUT_S = 10.0
 
 _CARD = """---
 library_name: elastic-env
@@ -46,8 +46,8 @@ The weights are in `{weights}`, described by `{description}`. Neither holds code
 """
 
 
-class Pushed(NamedTuple):
-    """What went to the hub.
+class PushResult(NamedTuple):
+    """A residual that was pushed to the hub.
 
     Attributes:
         url: Address of the commit.
@@ -58,13 +58,13 @@ class Pushed(NamedTuple):
     digest: str
 
 
-class Pulled(NamedTuple):
-    """What came from the hub.
+class PullResult(NamedTuple):
+    """A residual that was pulled from the hub.
 
     Attributes:
-        folder: Where it is.
-        commit: Of the repository.
-        description: Of the residual.
+        folder: Its folder.
+        commit: Commit of the repository.
+        description: Description of the residual.
     """
 
     folder: Path
@@ -72,8 +72,8 @@ class Pulled(NamedTuple):
     description: ResidualDescription
 
 
-def push_residual(folder: Path, repository: str, public: bool = False) -> Pushed:
-    """Put a residual into a repository of the hub, which is made if there is none.
+def push_residual(folder: Path, repository: str, public: bool = False) -> PushResult:
+    """Push a residual to a repository of the hub, and create the repository if it is missing.
 
     Args:
         folder: A residual's folder, or the name of one that comes with the package.
@@ -81,15 +81,15 @@ def push_residual(folder: Path, repository: str, public: bool = False) -> Pushed
         public: True for a new repository that everybody may read.
 
     Raises:
-        ConfigurationError: It is no residual, is damaged or without a digest, or the repository
-            cannot be written.
+        ConfigurationError: The folder is no residual, is damaged or has no digest, or the
+            repository cannot be written.
         MissingExtraError: The package huggingface_hub is missing.
         SystemFailedError: The hub does not answer.
     """
     folder = find_folder(folder)
     description, _ = load_residual(folder)
-    digest = _digest_of(description, folder)
-    hub = _hub()
+    digest = _weights_digest(description, folder)
+    hub = _import_hub()
     card = _CARD.format(
         base=description.base,
         robot=description.robot,
@@ -105,12 +105,12 @@ def push_residual(folder: Path, repository: str, public: bool = False) -> Pushed
         for name, content in files.items()
     ]
     api = hub.HfApi(endpoint=_endpoint())
-    with _one_sentence(repository, None):
+    with _explain_errors(repository, None):
         api.create_repo(repository, private=not public, exist_ok=True)
         commit = api.create_commit(
             repository, additions, commit_message=f"Residual with weights {digest[:12]}"
         )
-    return Pushed(str(commit.commit_url), digest)
+    return PushResult(str(commit.commit_url), digest)
 
 
 def pull_residual(
@@ -120,43 +120,43 @@ def pull_residual(
     digest: str | None = None,
     offline: bool = False,
     output: Path | None = None,
-) -> Pulled:
-    """Take a residual from a repository of the hub, or from the hub's cache on this computer.
+) -> PullResult:
+    """Pull a residual from a repository of the hub, or from the hub's cache on this computer.
 
     Args:
         repository: OWNER/NAME.
         revision: Branch, tag or commit.
-        digest: SHA-256 that the weights must have; None for that of the description alone.
-        offline: True to ask nobody, and take what was pulled before.
+        digest: SHA-256 that the weights must have; None to check only that of the description.
+        offline: True to use only the cache, without a network.
         output: Folder for it, new or empty; None for hub/OWNER/NAME.
 
     Raises:
-        ConfigurationError: There is no such repository or revision, it holds no residual, one of
-            its files is too large, or a digest differs; nothing is written then.
+        ConfigurationError: There is no such repository or revision, it has no residual, one of its
+            files is too large, or a digest differs. Nothing is written then.
         MissingExtraError: The package huggingface_hub is missing.
         ResultsExistError: The folder is not empty.
         SystemFailedError: The hub does not answer.
     """
-    hub = _hub()
-    with _one_sentence(repository, revision):
+    hub = _import_hub()
+    with _explain_errors(repository, revision):
         if not offline:
             _require_small(hub, repository, revision)
-        asked = {"revision": revision, "local_files_only": offline, "endpoint": _endpoint()}
-        paths = [Path(hub.hf_hub_download(repository, name, **asked)) for name in _MOST_BYTES]
+        options = {"revision": revision, "local_files_only": offline, "endpoint": _endpoint()}
+        paths = [Path(hub.hf_hub_download(repository, name, **options)) for name in _MOST_BYTES]
     commits = {path.parent.name for path in paths}
     if len(commits) > 1:
         raise SystemFailedError(f"{repository} changed while it was pulled; pull it again")
     files = {path.name: read_bounded(path, _MOST_BYTES[path.name]) for path in paths}
-    with TemporaryDirectory() as place:
-        description = _checked(files, Path(place), repository, digest)
+    with TemporaryDirectory() as temporary:
+        description = _check_files(files, Path(temporary), repository, digest)
     with result_folder("hub", HUB / repository if output is None else output) as folder:
         for name, content in files.items():
             write_whole(folder / name, content)
-    return Pulled(folder, commits.pop(), description)
+    return PullResult(folder, commits.pop(), description)
 
 
-def _hub() -> Any:
-    """The package of the hub."""
+def _import_hub() -> Any:
+    """Import the package huggingface_hub."""
     try:
         import huggingface_hub
     except ImportError:
@@ -165,16 +165,16 @@ def _hub() -> Any:
 
 
 def _endpoint() -> str | None:
-    """Address of the hub, where the environment names another one."""
+    """Address of the hub from the environment variable; None for the usual one."""
     return os.environ.get(_ENDPOINT)
 
 
 def _require_small(hub: Any, repository: str, revision: str) -> None:
     """Refuse a repository without the files of a residual, or with files that are too large."""
     api = hub.HfApi(endpoint=_endpoint())
-    asked = {"revision": revision, "files_metadata": True, "timeout": _PATIENCE_S}
-    found = api.model_info(repository, **asked)
-    sizes = {file.rfilename: file.size for file in found.siblings or []}
+    options = {"revision": revision, "files_metadata": True, "timeout": _TIMEOUT_S}
+    info = api.model_info(repository, **options)
+    sizes = {file.rfilename: file.size for file in info.siblings or []}
     for name, most in _MOST_BYTES.items():
         if name not in sizes:
             raise ConfigurationError(
@@ -183,33 +183,34 @@ def _require_small(hub: Any, repository: str, revision: str) -> None:
             )
         size = sizes[name]
         if size is None or not 0 < size <= most:
-            said = "says no size" if size is None else f"has {size}"
+            problem = "has no size" if size is None else f"has {size}"
             raise ConfigurationError(
-                f"{name} of {shorten(repository)} must have 1 to {most} bytes, it {said}"
+                f"{name} of {shorten(repository)} must have 1 to {most} bytes, it {problem}"
             )
 
 
-def _checked(
-    files: dict[str, bytes], place: Path, repository: str, digest: str | None
+def _check_files(
+    files: dict[str, bytes], temporary: Path, repository: str, digest: str | None
 ) -> ResidualDescription:
-    """Description of a residual whose network and digest are right."""
+    """Check network and digest of a residual in a temporary folder; return its description."""
     for name, content in files.items():
-        write_whole(place / name, content)
+        write_whole(temporary / name, content)
     try:
-        description, _ = load_residual(place)
+        description, _ = load_residual(temporary)
     except ConfigurationError as error:
-        said = str(error).replace(f"{place}/", "").replace(str(place), shorten(repository))
-        raise ConfigurationError(f"{shorten(repository)} is not used: {said}") from None
-    found = _digest_of(description, Path(repository))
-    if digest is not None and digest != found:
+        problem = str(error).replace(f"{temporary}/", "")
+        problem = problem.replace(str(temporary), shorten(repository))
+        raise ConfigurationError(f"{shorten(repository)} is not used: {problem}") from None
+    actual = _weights_digest(description, Path(repository))
+    if digest is not None and digest != actual:
         raise ConfigurationError(
-            f"the weights of {shorten(repository)} have the SHA-256 digest {found}, and --sha256"
-            f" {quote(digest)[1:-1]} was asked for; ask who pushed it which one is right"
+            f"the weights of {shorten(repository)} have the SHA-256 digest {actual}, and --sha256"
+            f" {quote(digest)[1:-1]} was asked for; ask its author which one is right"
         )
     return description
 
 
-def _digest_of(description: ResidualDescription, folder: Path) -> str:
+def _weights_digest(description: ResidualDescription, folder: Path) -> str:
     if description.weights_sha256 is None:
         raise ConfigurationError(
             f"{DESCRIPTION} of {shorten(folder)} names no digest of its weights; give it their"
@@ -219,13 +220,13 @@ def _digest_of(description: ResidualDescription, folder: Path) -> str:
 
 
 @contextmanager
-def _one_sentence(repository: str, revision: str | None) -> Iterator[None]:
-    """Say what the hub refuses in one sentence each."""
-    from httpx2 import HTTPError  # what the package speaks with
+def _explain_errors(repository: str, revision: str | None) -> Iterator[None]:
+    """Turn errors of the hub's package into errors with a cause and a cure."""
+    from httpx2 import HTTPError  # the HTTP client of huggingface_hub
     from huggingface_hub import errors
 
     name = shorten(repository)
-    refused = {
+    problems = {
         errors.HFValidationError: "a repository is OWNER/NAME, in letters, digits, and . _ -, got"
         f" {quote(repository)}",
         errors.RevisionNotFoundError: f"{name} has no revision {quote(revision)}; give a branch, a"
@@ -237,9 +238,9 @@ def _one_sentence(repository: str, revision: str | None) -> Iterator[None]:
     }
     try:
         yield
-    except tuple(refused) as error:
-        said = next(text for kind, text in refused.items() if isinstance(error, kind))
-        raise ConfigurationError(said) from None
+    except tuple(problems) as error:
+        problem = next(text for kind, text in problems.items() if isinstance(error, kind))
+        raise ConfigurationError(problem) from None
     except errors.HfHubHTTPError as error:
         status = getattr(error.response, "status_code", None)
         if status in (401, 403):

@@ -1,4 +1,4 @@
-"""What a residual computes between its features and the inputs of its base, as plain arrays."""
+"""Layout of a residual for exports: features, network, mirror and bounds, as plain arrays."""
 
 from collections.abc import Sequence
 from contextlib import closing
@@ -23,7 +23,7 @@ from train.evaluate.environments import ENVIRONMENTS
 from train.evaluate.rollout import make_vector_env
 
 _HEAVY_TAIL = 3.0
-"""Degrees of freedom of random features: two in a thousand are beyond ten standard deviations."""
+"""Degrees of freedom of random features: two of a thousand are beyond ten standard deviations."""
 
 
 @dataclass(frozen=True)
@@ -31,17 +31,17 @@ class ResidualLayout:
     """A residual's features, network, mirror and bounds.
 
     Attributes:
-        name: Of its policy, such as residual:testbed/seed_0.
+        name: Name of its policy, such as residual:testbed/seed_0.
         description: Content of its `residual.json`.
-        network: From features to numbers within [−1, 1].
+        network: Maps features to numbers within [−1, 1].
         tensors: Weights of the network.
         weights_sha256: Digest of their file.
         features: Columns that it sees; `NAME@-k` is a measurement of k decisions ago.
         residual: Numbers that it decides.
         columns: Columns of its base's inputs, on which it acts.
-        bounds: Of these, (columns,), zero where it does not act.
-        source: Number of the residual that each follows, (columns,).
-        mirrors: Of features and residual in steps on the right foot; None without.
+        bounds: Bounds of these columns, (columns,); zero where it does not act.
+        source: Index of the residual that each column follows, (columns,).
+        mirrors: Mirrors of features and residual in steps on the right foot; None without.
         control_period_s: Time between two commands [s].
     """
 
@@ -59,8 +59,8 @@ class ResidualLayout:
     control_period_s: float
 
     @classmethod
-    def of(cls, name: str, env: str | None = None) -> Self:
-        """Of a residual in the environment that it was trained in.
+    def load(cls, name: str, env: str | None = None) -> Self:
+        """Load the layout of a residual in the environment that it was trained in.
 
         Args:
             name: residual:PATH, a folder or the name of one that comes with the package.
@@ -83,7 +83,7 @@ class ResidualLayout:
             raise ConfigurationError(
                 f"{name} is a teacher, which sees the true {seen}, and no residual for a robot"
             )
-        with closing(_environment(description, env)) as worlds:
+        with closing(_make_world(description, env)) as worlds:
             policy: Any = baselines.make(name, worlds)
         tensors, content = read_tensors(folder / WEIGHTS)
         channels = policy.corrected.channels
@@ -112,34 +112,34 @@ class ResidualLayout:
         """Residual and correction of a decision, (N, k) and (N, columns).
 
         Args:
-            features: Before the mirror, (N, width).
-            on_right: Whether the step is on the right foot, (N, 1); without effect where there is
-                no mirror.
+            features: Features before the mirror, (N, width).
+            on_right: True if the step is on the right foot, (N, 1); without a mirror it has no
+                effect.
         """
         if self.mirrors is None:
             residual = self.network(features)
         else:
-            of_features, of_residual = self.mirrors
-            residual = self.network(np.where(on_right, of_features(features), features))
-            residual = np.where(on_right, of_residual(residual), residual)
+            mirror_features, mirror_residual = self.mirrors
+            residual = self.network(np.where(on_right, mirror_features(features), features))
+            residual = np.where(on_right, mirror_residual(residual), residual)
         return residual, self.bounds * residual[:, self.source]
 
     def draw(self, count: int, seed: int = 0) -> dict[str, Any]:
-        """Random arguments of `decide`; some features are beyond the bound of normalised ones."""
+        """Draw random arguments of `decide`; some features are beyond the bound of the network."""
         generator = np.random.default_rng(seed)
         shape = (count, len(self.features))
         normalised = generator.standard_t(_HEAVY_TAIL, shape)
         features = self.tensors["mean"] + self.tensors["std"] * normalised
         on_right = generator.random((count, 1)) < 0.5
-        if self.mirrors is not None:  # the network sees them as drawn
+        if self.mirrors is not None:  # `decide` mirrors them back
             features = np.where(on_right, self.mirrors[0](features), features)
         return {"features": features, "on_right": on_right}
 
     def facts(self) -> dict[str, Any]:
-        """What one must know to use it, in types of JSON."""
+        """Facts that a user of the export needs, in types of JSON."""
         settings = self.description.settings
         turns = settings.cutoff_hz * self.control_period_s
-        columns = _listed(self.columns)
+        columns = _signal_records(self.columns)
         for column, bound in zip(columns, self.bounds.tolist(), strict=True):
             column["bound"] = bound
         return {
@@ -154,19 +154,19 @@ class ResidualLayout:
             "decision_period": settings.decision_period,
             "cutoff_hz": settings.cutoff_hz,
             "share_per_control_step": 1.0 - float(np.exp(-2.0 * np.pi * turns)),
-            "features": _listed(self.features),
-            "residual": _listed(self.residual),
+            "features": _signal_records(self.features),
+            "residual": _signal_records(self.residual),
             "correction": columns,
         }
 
 
-def _listed(signals: Sequence[Signal]) -> list[dict[str, Any]]:
+def _signal_records(signals: Sequence[Signal]) -> list[dict[str, Any]]:
     keys = ("name", "unit", "meaning")
     return [{key: asdict(signal)[key] for key in keys} for signal in signals]
 
 
-def _environment(description: ResidualDescription, env: str | None) -> Any:
-    """One world of the environment of a residual."""
+def _make_world(description: ResidualDescription, env: str | None) -> Any:
+    """Make one world of the environment of a residual."""
     name = description.robot if env is None else env
     if env is None and name not in ENVIRONMENTS:
         raise ConfigurationError(

@@ -16,25 +16,25 @@ FAILED = _CHART["failed"]
 RAMP = _CHART["ramp"]
 SCORED = _CHART["scored"]
 COLOURS: dict[str, str] = _DATA["baselines"]
-"""Of the baselines."""
+"""Colours of the baselines."""
 STRONG: list[str] = _DATA["strong"]
-"""Of residuals and of one's own policies: far from the baselines' and from one another."""
+"""Colours of residuals and users' policies, unlike those of the baselines and unlike each other."""
 VERDICTS: dict[str, str] = _DATA["verdicts"]
-"""Of changes by their verdict."""
+"""Colours of changes by their verdict."""
 NIGHT: dict[str, str] = _DATA["night"]
-"""Colours in the dark in place of those that would not be seen there, in all parts of a chart."""
+"""Colours on a dark page, by the colours that would be invisible there, in all parts of a chart."""
 _DASHED = ("zero", "rigid", "uncompensated_open", "input_open")
 
 
 def policy_colours(policies: Sequence[str]) -> dict[str, str]:
-    """A colour for every policy: those without one of their own take the others in turn."""
-    unnamed = [policy for policy in dict.fromkeys(policies) if policy not in COLOURS]
+    """A colour for every policy: its own, or else the next of `STRONG`."""
+    others = [policy for policy in dict.fromkeys(policies) if policy not in COLOURS]
     return {
-        policy: COLOURS.get(policy) or STRONG[unnamed.index(policy) % len(STRONG)]
+        policy: COLOURS.get(policy) or STRONG[others.index(policy) % len(STRONG)]
         for policy in policies
     }
 
 
 def dash_of(policy: str) -> str:
-    """Dash of a policy's line: no center of mass is fed back where it is not solid."""
+    """Dash of a policy's line: dashed for policies without feedback of the center of mass."""
     return "dash" if policy in _DASHED else "solid"

@@ -1,4 +1,4 @@
-"""The pictures of a comparison: which are drawn, what they show, and names of their files."""
+"""The pictures of a comparison: their choice, their content, and the names of their files."""
 
 import re
 from collections.abc import Callable, Sequence
@@ -18,7 +18,7 @@ from train.evaluate.environments import Column, TracedSignal
 from train.evaluate.episodes import Evaluation, group_by
 from train.evaluate.maps import HeatMap
 from train.evaluate.rollout import make_vector_env
-from train.figures.chart import Cells, Curve, Panel, median, sweep_chart, time_chart
+from train.figures.chart import Cells, Curve, Panel
 from train.figures.colours import policy_colours
 from train.figures.map_plots import draw_map
 from train.figures.plots import (
@@ -31,19 +31,21 @@ from train.figures.plots import (
     new_figure,
     save,
 )
+from train.figures.score_charts import median, sweep_chart
+from train.figures.time_chart import time_chart
 
 _MIN_SWEPT_REFERENCES = 3
-"""From so many references with a number of their own on, the scores are drawn against it."""
+"""Fewest references with different numbers for which scores are drawn over the number."""
 _MOST_LINES = 4
-"""Lines of a panel over time."""
+"""Most lines of a panel over time."""
 _PAPER_BOUND_MRAD = 10.0
-"""The pelvis error stays below it with compensation in the paper, in its two gaits."""
+"""Bound of the pelvis error with compensation in the paper, in its two gaits."""
 _PAPER_FIGURES = {"pelvis": {"24 s": 7, "3 s": 8}, "zmp": {"24 s": 9, "3 s": 10}}
 _PAPER_SCENARIOS = ("ideal", "nominal")
 _SUBJECTS = {"pelvis": "Pelvis error. ", "zmp": "Zero moment point. "}
 """Beginnings of the titles of pictures of a walk."""
 _PAPER_RANGES_MRAD = {"uncompensated": (-56.2, 41.7), "input": (-3.7, 7.1)}
-"""Fig. 6 of the paper."""
+"""Ranges of the link error at rest in Fig. 6 of the paper."""
 
 
 def draw_figures(
@@ -56,23 +58,23 @@ def draw_figures(
     """Draw the figures of a comparison.
 
     Args:
-        evaluations: All cells, the training seeds of a residual put together.
-        folder: Where to.
-        policies: Policies of the time series, all if empty.
+        evaluations: All cells, the training seeds of a residual joined.
+        folder: Folder for the files.
+        policies: Policies of the time series; all if empty.
         swept: Title of the axis of swept options; None without a sweep.
-        figure_format: Of the files.
+        figure_format: Format of the files.
     """
-    known = evaluations[0].condition.environment
+    environment = evaluations[0].condition.environment
     files = []
-    for name, chart in sweep_charts(evaluations, swept, known.swept).items():
+    for name, chart in sweep_charts(evaluations, swept, environment.swept).items():
         files.append(draw_chart(chart, folder / f"sweep_{name}.{figure_format}"))
     if swept is not None:
         return files
     overview = folder / f"overview.{figure_format}"
-    files.insert(0, draw_overview(evaluations, known.judged, overview))
-    for group in cells_together(evaluations):
+    files.insert(0, draw_overview(evaluations, environment.judged, overview))
+    for group in group_cells(evaluations):
         by_policy = group_by(group, lambda e: e.condition.policy.title)
-        shown = [own for t, own in by_policy.items() if not policies or t in policies]
+        shown = [seeds for t, seeds in by_policy.items() if not policies or t in policies]
         files += draw_signals(list(chain(*shown)), folder, figure_format) if shown else []
     return files
 
@@ -81,27 +83,24 @@ def draw_maps(
     maps: Sequence[HeatMap], folder: Path, figure_format: FigureFormat = "png"
 ) -> list[Path]:
     """Draw the maps of a comparison, a picture per scenario, motion and metric."""
-    files = []
-    for found in maps:
-        name = _safe(f"{found.title}_{found.column.metric}")
-        files.append(draw_map(found, folder / f"map_{name}.{figure_format}"))
-    return files
+    names = [_file_name(f"map_{m.title}_{m.column.metric}.{figure_format}") for m in maps]
+    return [draw_map(m, folder / name) for m, name in zip(maps, names, strict=True)]
 
 
 def draw_signals(
     evaluations: Evaluations, folder: Path, figure_format: FigureFormat = "png"
 ) -> list[Path]:
-    """Draw the signals of one motion and scenario over time, and what it shows at rest.
+    """Draw the signals of one motion and scenario over time, and static errors if it has any.
 
     Args:
         evaluations: The policies, a line each.
-        folder: Where to.
-        figure_format: Of the files.
+        folder: Folder for the files.
+        figure_format: Format of the files.
     """
     first = evaluations[0]
-    known = first.condition.environment
+    signal_groups = group_by(first.condition.environment.curves, lambda signal: signal.picture)
     files = []
-    for name, signals in group_by(known.curves, lambda signal: signal.picture).items():
+    for name, signals in signal_groups.items():
         if name:
             path = folder / f"{figure_name(name, first)}.{figure_format}"
             files.append(draw_picture(name, signals, evaluations, path))
@@ -117,7 +116,7 @@ def draw_picture(
 ) -> Path:
     """Draw signals of several policies over time, as Figs. 7 to 10 of the paper.
 
-    A panel has four lines at most, so several policies have several panels.
+    A panel has at most four lines, so more policies have more panels.
     """
     condition = evaluations[0].condition
     policies = {e.condition.policy.title: [e] for e in evaluations}
@@ -128,12 +127,12 @@ def draw_picture(
     if number is not None:
         title = f"{title} (cf. Fig. {number} of the paper)"
         if name == "pelvis":
-            chart = replace(chart, panels=list(map(_with_bounds, chart.panels)))
+            chart = replace(chart, panels=list(map(_add_paper_bounds, chart.panels)))
     return draw_chart(replace(chart, title=title), path)
 
 
-def _with_bounds(panel: Panel) -> Panel:
-    """A panel of the pelvis error with the bounds that the paper's stays in."""
+def _add_paper_bounds(panel: Panel) -> Panel:
+    """Return a panel of the pelvis error with the bounds of the paper's pelvis error."""
     bound = _PAPER_BOUND_MRAD
     name = f"paper, compensated: ±{bound:.0f} mrad"
     ends = panel.curves[0].x[[0, -1]]
@@ -147,38 +146,37 @@ def _with_bounds(panel: Panel) -> Panel:
 
 
 def figure_name(name: str, evaluation: Evaluation) -> str:
-    """Name of a figure's file; the paper's conditions have the number of its figure in front."""
+    """Name of a figure's file; for conditions of the paper it begins with its figure's number."""
     number = paper_figure(name, evaluation.condition)
-    return f"{'' if number is None else f'fig{number}_'}{name}_{_stem(evaluation)}"
+    return f"{'' if number is None else f'fig{number}_'}{name}_{_cell_name(evaluation)}"
 
 
 def paper_figure(name: str, condition: Condition) -> int | None:
-    """Number of the paper's figure that a picture of a condition stands beside, if there is one."""
-    is_like_the_paper = condition.scenario in _PAPER_SCENARIOS
-    numbers = _PAPER_FIGURES.get(name, {}) if is_like_the_paper else {}
-    return numbers.get(condition.reference_name)
+    """Number of the paper's figure that corresponds to a picture of a condition, if any."""
+    if condition.scenario not in _PAPER_SCENARIOS:
+        return None
+    return _PAPER_FIGURES.get(name, {}).get(condition.reference_name)
 
 
-def cells_together(evaluations: Evaluations) -> list[list[Evaluation]]:
-    """Evaluations of the same reference and scenario together."""
-    cells = group_by(evaluations, lambda e: e.condition.cell[:2])
-    return list(cells.values())
+def group_cells(evaluations: Evaluations) -> list[list[Evaluation]]:
+    """Group evaluations by reference and scenario."""
+    return list(group_by(evaluations, lambda e: e.condition.cell[:2]).values())
 
 
-def by_option(evaluations: Evaluations) -> Cells:
-    """Evaluations of every policy by the swept value; None for a policy that was not swept."""
-    return _by_policy(evaluations, lambda e: next(iter(e.condition.swept.values()), None))
+def group_by_option(evaluations: Evaluations) -> Cells:
+    """Group evaluations of every policy by the swept value; None if the policy is not swept."""
+    return _group_policies(evaluations, lambda e: next(iter(e.condition.swept.values()), None))
 
 
-def by_reference(evaluations: Evaluations) -> Cells:
-    """Evaluations of every policy by the number of the reference, such as the step period [s]."""
+def group_by_reference(evaluations: Evaluations) -> Cells:
+    """Group evaluations of every policy by the number of the reference, such as a step period."""
     numbered = [e for e in evaluations if e.condition.number is not None]
-    return _by_policy(numbered, lambda e: e.condition.number)
+    return _group_policies(numbered, lambda e: e.condition.number)
 
 
-def _by_policy(evaluations: Evaluations, key: Callable[[Evaluation], Any]) -> Cells:
+def _group_policies(evaluations: Evaluations, key: Callable[[Evaluation], Any]) -> Cells:
     policies = group_by(evaluations, lambda e: e.condition.policy.title)
-    return {title: group_by(own, key) for title, own in policies.items()}
+    return {title: group_by(cells, key) for title, cells in policies.items()}
 
 
 def sweep_charts(
@@ -187,31 +185,30 @@ def sweep_charts(
     columns: Sequence[Column],
     statistic: Any = median,
 ) -> dict[str, Any]:
-    """Scores over a swept option, or over what the references differ in.
+    """Charts of scores over a swept option, or over the numbers of the references.
 
     Args:
         evaluations: All cells.
         swept: Title of the axis of swept options; None without a sweep.
-        columns: A panel for each.
+        columns: Metrics, a panel for each.
         statistic: See `sweep_chart`.
 
     Returns:
         Charts by the ends of the names of their files.
     """
-    known = evaluations[0].condition.environment
     colours = policy_colours([e.condition.policy.title for e in evaluations])
-    found = {}
+    charts = {}
     if swept is not None:
-        for own in cells_together(evaluations):
-            chart = sweep_chart(by_option(own), columns, swept, colours, statistic)
-            found[_stem(own[0])] = replace(chart, title=_title(own[0].condition))
-        return found
-    for scenario, own in group_by(evaluations, lambda e: e.condition.scenario).items():
-        if has_swept_references(own):
-            label = f"{known.quantity} [s]"
-            chart = sweep_chart(by_reference(own), columns, label, colours, statistic)
-            found[_safe(scenario)] = replace(chart, title=f"Scenario {scenario}")
-    return found
+        for group in group_cells(evaluations):
+            chart = sweep_chart(group_by_option(group), columns, swept, colours, statistic)
+            charts[_cell_name(group[0])] = replace(chart, title=_title(group[0].condition))
+        return charts
+    label = f"{evaluations[0].condition.environment.quantity} [s]"
+    for scenario, group in group_by(evaluations, lambda e: e.condition.scenario).items():
+        if has_swept_references(group):
+            chart = sweep_chart(group_by_reference(group), columns, label, colours, statistic)
+            charts[_file_name(scenario)] = replace(chart, title=f"Scenario {scenario}")
+    return charts
 
 
 def _title(condition: Condition) -> str:
@@ -220,18 +217,18 @@ def _title(condition: Condition) -> str:
 
 
 def has_swept_references(evaluations: Evaluations) -> bool:
-    """True if enough references have a number, and each one of its own: points of one axis."""
+    """True if enough references have a number and no two have the same: points of one axis."""
     numbers = {e.condition.reference_name: e.condition.number for e in evaluations}
-    known = [number for number in numbers.values() if number is not None]
-    return len(known) >= _MIN_SWEPT_REFERENCES and len(set(known)) == len(known)
+    points = [number for number in numbers.values() if number is not None]
+    return len(points) >= _MIN_SWEPT_REFERENCES and len(set(points)) == len(points)
 
 
-def _stem(evaluation: Evaluation) -> str:
+def _cell_name(evaluation: Evaluation) -> str:
     condition = evaluation.condition
-    return _safe(f"{condition.reference_name}_{condition.scenario}")
+    return _file_name(f"{condition.reference_name}_{condition.scenario}")
 
 
-def _safe(text: str) -> str:
+def _file_name(text: str) -> str:
     return re.sub(r"[^\w.+-]+", "_", text)
 
 
@@ -252,7 +249,8 @@ def draw_static_errors(evaluations: Evaluations, model: RobotModel, path: Path) 
         style |= open_dots if index else {"color": shade}
         low = error.min()
         high = error.max()
-        label = f"{label_text(policy)}: {low:+.1f} to {high:+.1f} mrad{_paper(policy)}"
+        paper_range = _paper_range_text(policy)
+        label = f"{label_text(policy)}: {low:+.1f} to {high:+.1f} mrad{paper_range}"
         torque = link_torque(points, gravity, points.q)
         axis.scatter(torque, error, s=34, label=label, **style)
         axis.axhspan(low, high, color=shade, alpha=0.08, lw=0)
@@ -271,7 +269,7 @@ def static_errors(evaluation: Evaluation) -> Array:
     return evaluation.rest_references - evaluation.points.q
 
 
-def _paper(policy: str) -> str:
+def _paper_range_text(policy: str) -> str:
     if policy not in _PAPER_RANGES_MRAD:
         return ""
     low, high = _PAPER_RANGES_MRAD[policy]

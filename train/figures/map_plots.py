@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from train.evaluate.changes import BEST_ANALYTIC, SIGNS, percent
 from train.evaluate.environments import Column
 from train.evaluate.maps import HeatMap, MapCell
+from train.evaluate.terms import BEST_ANALYTIC, SIGNS, percent
 from train.figures.colours import INK, policy_colours
 from train.figures.plots import new_figure, save
 
@@ -23,10 +23,10 @@ _SCORE = "#2a6f97"
 _EMPTY = "#f1f3f5"
 _STRONGEST = 0.75
 _STRONGEST_CHANGE = 1.0
-"""Share of a colour in the strongest square, and the change from which on it has that share."""
+"""Share of a colour in the strongest square, and the smallest change that has this share."""
 _BEST_SHARE = 0.32
 """Share of a policy's colour in a square that it wins."""
-_UNBROKEN = "\N{NO-BREAK SPACE}"
+_NO_BREAK_SPACE = "\N{NO-BREAK SPACE}"
 
 
 Ends = tuple[float, float]
@@ -37,9 +37,9 @@ class Square:
     """A cell of a panel.
 
     Attributes:
-        text: What it says.
+        text: Its text.
         small: A second line; empty for none.
-        colour: Its background.
+        colour: Colour of its background.
     """
 
     text: str
@@ -55,14 +55,14 @@ class Square:
 
 @dataclass(frozen=True)
 class Panel:
-    """A heat map of one thing.
+    """One heat map: the best policy, the change of a residual, or the score of a policy.
 
     Attributes:
-        title: What it shows.
-        x_label, y_label: What the axes say.
-        x_ticks, y_ticks: Their values as they are shown.
-        squares: (len(y_ticks), len(x_ticks)), from the least y on.
-        is_main: Whether pictures show it too.
+        title: Its title.
+        x_label, y_label: Titles of the axes.
+        x_ticks, y_ticks: Texts of their values.
+        squares: (len(y_ticks), len(x_ticks)), the smallest y first.
+        is_main: True if pictures show it too.
         key: Letters, policies and colours that its squares refer to.
     """
 
@@ -77,7 +77,7 @@ class Panel:
 
 
 def panels(heat_map: HeatMap) -> list[Panel]:
-    """Who is best, every residual against the best without learning, and every policy's score."""
+    """The best policy, changes of residuals against the best without learning, and scores."""
     column = heat_map.column
     policies = heat_map.table.policies
     x_ticks, y_ticks = heat_map.ticks
@@ -103,24 +103,24 @@ def panels(heat_map: HeatMap) -> list[Panel]:
         )
 
     best = partial(_best_square, column=column, letters=letters, shades=shades)
-    found = [panel(f"Best policy, and its {column.label}", best, key=key)]
+    result = [panel(f"Best policy, and its {column.label}", best, key=key)]
     for title in heat_map.table.members:
         change = partial(_change_square, title=title, letters=rival_letters)
-        what = f"{title} against the {BEST_ANALYTIC}, change of {column.title} [%]"
-        found.append(panel(what, change))
+        panel_title = f"{title} against the {BEST_ANALYTIC}, change of {column.title} [%]"
+        result.append(panel(panel_title, change))
     for title in policies:
         score = partial(_score_square, title=title, column=column, ends=ends)
-        found.append(panel(f"{title}, {column.label}", score, is_main=False))
-    return found
+        result.append(panel(f"{title}, {column.label}", score, is_main=False))
+    return result
 
 
 def draw_map(heat_map: HeatMap, path: Path) -> Path:
-    """Draw the main panels of a map, one below the other, in a width that a telephone shows."""
-    shown = [panel for panel in panels(heat_map) if panel.is_main]
+    """Draw the main panels of a map, one below the other, narrow enough for a telephone."""
+    main_panels = [panel for panel in panels(heat_map) if panel.is_main]
     columns, rows = map(len, heat_map.ticks)
-    size = max(0.72 * columns + 0.9, 4.4), (0.5 * rows + 1.25) * len(shown) + 0.35
-    figure, axes = new_figure(len(shown), 1, size)
-    for axis, panel in zip(axes, shown, strict=True):
+    size = max(0.72 * columns + 0.9, 4.4), (0.5 * rows + 1.25) * len(main_panels) + 0.35
+    figure, axes = new_figure(len(main_panels), 1, size)
+    for axis, panel in zip(axes, main_panels, strict=True):
         _draw_panel(axis, panel)
     figure.suptitle(heat_map.title, fontsize=9, color="#59636e")
     return save(figure, path)
@@ -131,14 +131,14 @@ def _best_square(
 ) -> Square:
     if cell.best is None:
         return Square("-", "", _EMPTY)
-    value = _figure(cell.levels[cell.best].value, column)
-    small = f"{value}{_falls(cell.failed[cell.best])}"
+    score = _score_text(cell.levels[cell.best].value, column)
+    small = f"{score}{_failures_text(cell.failed[cell.best])}"
     colour = blend(shades[cell.best], _BEST_SHARE)
     return Square(letters.get(cell.best, "?"), small, colour)
 
 
 def _change_square(cell: MapCell, title: str, letters: Mapping[str, str]) -> Square:
-    """A change, with a sign where it is not told from chance; green below zero, red above."""
+    """Square of a change, with the sign of its verdict; green below zero, red above."""
     change = cell.learned.get(title)
     if change is None or not np.isfinite(change.relative.value):
         return Square("-", "", _EMPTY)
@@ -152,27 +152,27 @@ def _change_square(cell: MapCell, title: str, letters: Mapping[str, str]) -> Squ
 
 
 def _score_square(cell: MapCell, title: str, column: Column, ends: Ends) -> Square:
-    falls = _falls(cell.failed.get(title, (0, 0))).strip()
+    failures = _failures_text(cell.failed.get(title, (0, 0))).strip()
     if title not in cell.levels or not cell.levels[title].is_known:
-        return Square("-", falls, _EMPTY)
+        return Square("-", failures, _EMPTY)
     value = cell.levels[title].value
     low, high = map(math.log, ends)
     share = (math.log(max(value, ends[0])) - low) / (high - low) if high > low else 0.0
     colour = blend(_SCORE, 0.06 + (_STRONGEST - 0.06) * share)
-    return Square(_figure(value, column), falls, colour)
+    return Square(_score_text(value, column), failures, colour)
 
 
-def _falls(failed: tuple[int, int]) -> str:
+def _failures_text(failed: tuple[int, int]) -> str:
     return f" ✕{failed[0]}/{failed[1]}" if failed[0] else ""
 
 
-def _figure(value: float, column: Column) -> str:
-    """A score in a square, where there is little room."""
+def _score_text(value: float, column: Column) -> str:
+    """A score with at most one decimal, since a square has little room."""
     return f"{column.scale * value:.{min(column.decimals, 1)}f}"
 
 
 def blend(colour: str, share: float) -> str:
-    """A colour on white, of which it covers a share."""
+    """Mix a share of a colour with white."""
     return "#" + "".join(
         f"{round(share * part + (1.0 - share) * 255):02x}" for part in _rgb(colour)
     )
@@ -206,7 +206,7 @@ def _draw_panel(axis: Any, panel: Panel) -> None:
         axis.spines[side].set_visible(False)
     if panel.key:
         entries = (f"{letter} {title}" for letter, title, _ in panel.key)
-        text = "   ".join(entry.replace(" ", _UNBROKEN) for entry in entries)
+        text = "   ".join(entry.replace(" ", _NO_BREAK_SPACE) for entry in entries)
         place = {"xycoords": "axes fraction", "textcoords": "offset points"}
         below = _wrap(text, 60)
         axis.annotate(below, (0.0, 0.0), (0, -34), fontsize=8, va="top", **place)
@@ -217,7 +217,7 @@ def _wrap(text: str, width: int = 52) -> str:
 
 
 def panel_rows(panel: Panel) -> tuple[list[str], list[list[str]]]:
-    """Head and rows of a panel as a table, the greatest y first."""
+    """Head and rows of a panel as a table, the largest y first."""
     head = [f"{panel.y_label} \\ {panel.x_label}", *panel.x_ticks]
     rows = [
         [tick, *(f"{square.text} {square.small}".strip() for square in row)]

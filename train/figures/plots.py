@@ -12,19 +12,19 @@ from elastic_env.core.errors import missing_extra
 from elastic_env.core.files import write_whole
 from train.evaluate.environments import Column
 from train.evaluate.episodes import Evaluation
-from train.evaluate.table import median_of
-from train.figures.chart import Chart, Curve, Evaluations, Mark
+from train.evaluate.scores import median_of
+from train.figures.chart import Chart, Curve, Evaluations, Mark, Panel
 from train.figures.colours import FAILED, INK, policy_colours
 from train.runs.escaping import visible
 
 FigureFormat = Literal["png", "pdf", "svg"]
-"""Ending of a picture's file, which says what it is written as."""
+"""Ending and format of a picture's file."""
 MRAD = 1e3
-"""Factor from rad to what figures show."""
+"""Factor from rad to the mrad that figures show."""
 
 
 def require_matplotlib() -> Any:
-    """Matplotlib's pyplot with our style, drawing into files.
+    """Return Matplotlib's pyplot with our style, drawing into files.
 
     Raises:
         MissingExtraError: It is not installed.
@@ -49,19 +49,19 @@ def new_figure(rows: int, columns: int, size: tuple[float, float], **shape: Any)
 
 
 def label_text(name: str) -> str:
-    """A text of the user's as a label, which Matplotlib leaves out if it begins with "_"."""
-    shown = visible(name)
-    return f" {shown}" if shown.startswith("_") else shown
+    """A user's name as a label; Matplotlib would leave it out if it began with "_"."""
+    text = visible(name)
+    return f" {text}" if text.startswith("_") else text
 
 
-def columns_of(entries: int, widest: int = 5) -> int:
-    """Columns of a legend, so that its rows are about equally full."""
-    rows = -(-entries // widest)
+def legend_columns(entries: int, most: int = 5) -> int:
+    """Number of columns of a legend, so that its rows have about equally many entries."""
+    rows = -(-entries // most)
     return -(-entries // max(rows, 1))
 
 
 def save(figure: Any, path: Path) -> Path:
-    """Write a figure as what the ending of its file says, and forget it."""
+    """Write a figure in the format of the file's ending, and close it."""
     for text in figure.findobj(lambda part: hasattr(part, "set_text")):
         text.set_text(visible(text.get_text()))
     content = io.BytesIO()
@@ -74,8 +74,8 @@ def save(figure: Any, path: Path) -> Path:
 def draw_chart(chart: Chart, path: Path) -> Path:
     """Draw the panels of a chart one below the other, with a legend below.
 
-    A panel has those of its curves beside it that the others lack. A filled cross on top stands
-    where all episodes of a policy failed, an open one where some did.
+    A panel with curves that the others lack has a legend of its own. A filled cross on top means
+    that all episodes of a policy failed, an open one that some failed.
     """
     heights = [panel.height for panel in chart.panels]
     size = (chart.width, sum(heights) + 1.2)
@@ -85,25 +85,10 @@ def draw_chart(chart: Chart, path: Path) -> Path:
         shade = {"color": "#e9ebee", "lw": 0, "zorder": 0, "label": chart.shade_name}
         for begin, end in chart.shaded:
             axis.axvspan(begin, end, **shade)
-        for curve in panel.curves:
-            _draw_curve(axis, curve, panel.limits)
-        axis.set_ylabel(panel.label)
+        _draw_panel(axis, panel)
         axis.grid(axis="x", visible=chart.ticks is not None)
-        if panel.is_log:
-            axis.set_yscale("log")
-            show_numbers(axis.yaxis)
-        if panel.limits is not None:
-            axis.set_ylim(*panel.limits)
-        if panel.rows:
-            names = [label_text(row) for row in panel.rows]
-            axis.set_yticks(range(len(names)), names, fontsize=8)
-            axis.grid(axis="y", visible=False)
-        elif panel.limits is not None and panel.limits[0] < 0.0 < panel.limits[1]:
-            axis.axhline(0.0, color="#777777", lw=0.8, zorder=1)
         if chart.ticks is None:
             axis.margins(x=0.0)
-        if panel.own:
-            _add_legend(axis, panel.own)
     if chart.ticks is not None:
         axes[-1].set_xscale("log")
         axes[-1].set_xticks(chart.ticks, [f"{value:g}" for value in chart.ticks])
@@ -114,35 +99,60 @@ def draw_chart(chart: Chart, path: Path) -> Path:
     axes[-1].set_xlabel(chart.label)
     if any(curve.fails for panel in chart.panels for curve in panel.curves):
         axes[-1].scatter([], [], marker="X", s=60, color=FAILED, label="fall")
-    once = {}
-    for axis in axes:
-        handles, labels = axis.get_legend_handles_labels()
-        once |= dict(zip(labels, handles, strict=True))
-    for title in chain(*(panel.own for panel in chart.panels)):
-        once.pop(label_text(title), None)
-    if chart.shade_name in once:  # behind the curves
-        once[chart.shade_name] = once.pop(chart.shade_name)
+    entries = _common_entries(axes, chart)
     figure.align_ylabels(axes)
-    ncols = columns_of(len(once))
-    figure.legend(once.values(), once.keys(), ncols=ncols, loc="outside lower center")
+    ncols = legend_columns(len(entries))
+    figure.legend(entries.values(), entries.keys(), ncols=ncols, loc="outside lower center")
     return save(figure, path)
 
 
-def _add_legend(axis: Any, titles: Sequence[str]) -> None:
-    """A legend of some curves to the right of a panel."""
+def _draw_panel(axis: Any, panel: Panel) -> None:
+    """Draw the curves of a panel, its y axis, and its own legend to the right."""
+    for curve in panel.curves:
+        _draw_curve(axis, curve, panel.limits)
+    axis.set_ylabel(panel.label)
+    if panel.is_log:
+        axis.set_yscale("log")
+        show_numbers(axis.yaxis)
+    if panel.limits is not None:
+        axis.set_ylim(*panel.limits)
+    if panel.rows:
+        names = [label_text(row) for row in panel.rows]
+        axis.set_yticks(range(len(names)), names, fontsize=8)
+        axis.grid(axis="y", visible=False)
+    elif panel.limits is not None and panel.limits[0] < 0.0 < panel.limits[1]:
+        axis.axhline(0.0, color="#777777", lw=0.8, zorder=1)
+    if panel.own_legend:
+        entries = _legend_entries(axis)
+        names = [label_text(title) for title in panel.own_legend]
+        place = {"loc": "center left", "bbox_to_anchor": (1.0, 0.5)}
+        axis.legend([entries[name] for name in names], names, fontsize=8, **place)
+
+
+def _common_entries(axes: Sequence[Any], chart: Chart) -> dict[str, Any]:
+    """Entries of the legend below a chart: those that no panel has in its own legend."""
+    entries = {}
+    for axis in axes:
+        entries |= _legend_entries(axis)
+    for title in chain(*(panel.own_legend for panel in chart.panels)):
+        entries.pop(label_text(title), None)
+    if chart.shade_name in entries:  # the shade comes after the curves
+        entries[chart.shade_name] = entries.pop(chart.shade_name)
+    return entries
+
+
+def _legend_entries(axis: Any) -> dict[str, Any]:
+    """Handles of an axis by their labels."""
     handles, labels = axis.get_legend_handles_labels()
-    known = dict(zip(labels, handles, strict=True))
-    names = [label_text(title) for title in titles]
-    place = {"loc": "center left", "bbox_to_anchor": (1.0, 0.5)}
-    axis.legend([known[name] for name in names], names, fontsize=8, **place)
+    return dict(zip(labels, handles, strict=True))
 
 
 def _draw_mark(axes: Sequence[Any], mark: Mark) -> None:
-    """A strip above the first panel; lines through all where it is one piece."""
+    """Draw a strip above the first panel; a single span also gets lines through all panels."""
     style = {"color": mark.colour, "lw": 0, "clip_on": False}
-    for place, (begin, end) in enumerate(mark.spans):
-        name = {} if place else {"label": mark.name}
-        axes[0].axvspan(begin, end, ymin=1.02, ymax=1.06, **style, **name)
+    for number, (begin, end) in enumerate(mark.spans):
+        label = {} if number else {"label": mark.name}
+        axes[0].axvspan(begin, end, ymin=1.02, ymax=1.06, **style, **label)
     if len(mark.spans) == 1:
         for axis, x in product(axes, mark.spans[0]):
             axis.axvline(x, color=mark.colour, lw=0.7, ls=":", zorder=1)
@@ -157,7 +167,7 @@ def _draw_curve(axis: Any, curve: Curve, limits: tuple[float, float] | None) -> 
         return
     style = {"marker": "o", "ms": 4} if curve.has_points else {}
     style |= {"color": colour, "lw": curve.width, "ls": _DASHES[curve.dash]}
-    # without a name Matplotlib has it in no legend
+    # Matplotlib leaves "_" out of the legend
     axis.plot(curve.x, curve.y, label=label_text(curve.name) or "_", **style)
     if curve.band is not None:
         axis.fill_between(curve.x, *curve.band, color=colour, alpha=0.18, lw=0)
@@ -172,7 +182,7 @@ _DASHES = {"solid": "-", "dash": "--", "dot": ":"}
 
 
 def show_numbers(axis: Any, numticks: int | None = None) -> None:
-    """Numbers instead of powers of ten on a logarithmic axis."""
+    """Show numbers instead of powers of ten on a logarithmic axis."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
     axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=numticks))
@@ -181,67 +191,81 @@ def show_numbers(axis: Any, numticks: int | None = None) -> None:
 
 
 def draw_overview(evaluations: Evaluations, columns: Sequence[Column], path: Path) -> Path:
-    """Metrics of every policy: a panel for each and every reference, or of one scenario one.
+    """Draw metrics of every policy: a panel per metric and reference; with one scenario per metric.
 
-    Bars are medians over the episodes that did not fail, with their 95 % intervals; dots these
-    episodes, crosses episodes that failed.
+    Bars are medians over the episodes that did not fail, with their 95 % intervals. Dots are these
+    episodes, crosses are failed ones.
     """
-    known = evaluations[0].condition.environment
-    titles = list(dict.fromkeys(e.condition.policy.title for e in evaluations))
-    shades = policy_colours(titles)
+    environment = evaluations[0].condition.environment
+    shades = policy_colours([e.condition.policy.title for e in evaluations])
     is_one_scenario = len({e.condition.scenario for e in evaluations}) == 1
-    panels: dict[str, dict[str, list[Evaluation]]] = {}
-    for e in evaluations:
-        reference = e.condition.reference_name
-        outer = known.title(reference)
-        inner = e.condition.scenario
-        if is_one_scenario:
-            outer = f"scenario {inner}"
-            inner = reference
-        panels.setdefault(outer, {}).setdefault(inner, []).append(e)
-    group_width = 0.35 + 0.14 * len(titles)
+    panels = _group_bars(evaluations, is_one_scenario)
+    group_width = 0.35 + 0.14 * len(shades)
     width = 1.2 + max(3.0, group_width * max(map(len, panels.values())))
-    stacked = width * len(panels) > _WIDEST
-    beside = 1 if stacked else len(panels)
-    rows = len(panels) * len(columns) // beside
+    is_stacked = width * len(panels) > _LARGEST_WIDTH
+    per_row = 1 if is_stacked else len(panels)
+    rows = len(panels) * len(columns) // per_row
     height = 3.8 if rows == 1 else 2.3
-    size = (min(width, 1.4 * _WIDEST) * beside, height * rows)
-    # each with its own groups below it: a reference need not be played in all scenarios
-    figure, axes = new_figure(rows, beside, size)
+    size = (min(width, 1.4 * _LARGEST_WIDTH) * per_row, height * rows)
+    # panels do not share groups, since a reference need not be played in all scenarios
+    figure, axes = new_figure(rows, per_row, size)
     for number, column in enumerate(columns):
-        own = axes[number * len(panels) :][: len(panels)]
-        for axis, (title, groups) in zip(own, panels.items(), strict=True):
+        column_axes = axes[number * len(panels) :][: len(panels)]
+        for axis, (title, groups) in zip(column_axes, panels.items(), strict=True):
             _draw_bars(axis, groups, column, shades)
-            if axis is not own[0]:
-                axis.sharey(own[0])
-            axis.set_title(title if stacked or not number else "")
+            if axis is not column_axes[0]:
+                axis.sharey(column_axes[0])
+            axis.set_title(title if is_stacked or not number else "")
             axis.set_ylabel(column.label if axis.get_subplotspec().is_first_col() else "")
-    if is_one_scenario and known.quantity:
-        axes[-beside].set_xlabel(known.quantity)
-    bar = axes[0].bar
-    names = {label_text(title): shade for title, shade in shades.items()}
-    handles = [bar(np.nan, 0.0, color=c, label=name) for name, c in names.items()]
-    if any(evaluation.num_failed for evaluation in evaluations):
-        cross = {"marker": "X", "s": 26, "color": FAILED, "label": known.failure}
-        handles.append(axes[0].scatter([], [], **cross))
-    if any(len(evaluation.episodes) > 1 for evaluation in evaluations):
-        handles.append(axes[0].scatter([], [], label="episode (bar: median)", **_DOTS))
-    if any(median_of(own, column.metric).has_interval for own in evaluations for column in columns):
-        style = {"marker": "|", "lw": 0.0, "ms": 9, "mew": _INTERVAL["lw"], "color": INK}
-        handles += axes[0].plot([], [], label="95 % interval of the median", **style)
-    ncols = columns_of(len(handles), max(int(size[0] / 1.7), 2))
+    if is_one_scenario and environment.quantity:
+        axes[-per_row].set_xlabel(environment.quantity)
+    handles = _overview_handles(axes[0], evaluations, columns, shades)
+    ncols = legend_columns(len(handles), max(int(size[0] / 1.7), 2))
     figure.legend(handles=handles, ncols=ncols, loc="outside lower center")
     return save(figure, path)
 
 
-_DOTS: dict[str, Any] = {"s": 4, "color": "#222222", "alpha": 0.45, "lw": 0, "zorder": 3}
-"""Looks of single episodes."""
-_INTERVAL: dict[str, Any] = {"lw": 1.3, "color": INK, "zorder": 4}
-"""Looks of an interval, beside the dots."""
-_WIDEST = 12.0
-"""Width beyond which panels stand one above the other [in]."""
-_ROOMY = 7
-"""From so many bars in a group on, the name of the group has room below it."""
+def _group_bars(
+    evaluations: Evaluations, is_one_scenario: bool
+) -> dict[str, dict[str, list[Evaluation]]]:
+    """Evaluations by panel and group: reference and scenario, or scenario and reference."""
+    panels: dict[str, dict[str, list[Evaluation]]] = {}
+    for e in evaluations:
+        reference = e.condition.reference_name
+        panel = e.condition.environment.title(reference)
+        group = e.condition.scenario
+        if is_one_scenario:
+            panel = f"scenario {group}"
+            group = reference
+        panels.setdefault(panel, {}).setdefault(group, []).append(e)
+    return panels
+
+
+def _overview_handles(
+    axis: Any, evaluations: Evaluations, columns: Sequence[Column], shades: Mapping[str, str]
+) -> list[Any]:
+    """Handles of the legend: policies, and failures, episodes and intervals if there are any."""
+    names = {label_text(title): shade for title, shade in shades.items()}
+    handles = [axis.bar(np.nan, 0.0, color=c, label=name) for name, c in names.items()]
+    if any(e.num_failed for e in evaluations):
+        failure = evaluations[0].condition.environment.failure
+        handles.append(axis.scatter([], [], marker="X", s=26, color=FAILED, label=failure))
+    if any(len(e.episodes) > 1 for e in evaluations):
+        handles.append(axis.scatter([], [], label="episode (bar: median)", **_DOT_STYLE))
+    if any(median_of(e, column.metric).has_interval for e in evaluations for column in columns):
+        style = {"marker": "|", "lw": 0.0, "ms": 9, "mew": _INTERVAL_STYLE["lw"], "color": INK}
+        handles += axis.plot([], [], label="95 % interval of the median", **style)
+    return handles
+
+
+_DOT_STYLE: dict[str, Any] = {"s": 4, "color": "#222222", "alpha": 0.45, "lw": 0, "zorder": 3}
+"""Style of single episodes."""
+_INTERVAL_STYLE: dict[str, Any] = {"lw": 1.3, "color": INK, "zorder": 4}
+"""Style of an interval, drawn next to the dots."""
+_LARGEST_WIDTH = 12.0
+"""Width beyond which panels are stacked [in]."""
+_WIDE_GROUP = 7
+"""Fewest bars of a group whose name fits below it without a slant."""
 
 
 def _draw_bars(
@@ -250,7 +274,7 @@ def _draw_bars(
     column: Column,
     shades: Mapping[str, str],
 ) -> None:
-    """A bar per policy in every group."""
+    """Draw a bar per policy in every group."""
     policies = list(shades)
     width = 0.84 / len(policies)
     for place, group in enumerate(groups.values()):
@@ -263,16 +287,16 @@ def _draw_bars(
             height = level.value if level.is_known else 0.0
             axis.bar(x, height, width=0.9 * width, color=shade)
             if len(e.episodes) > 1:
-                axis.scatter(np.full(len(values), x), values, **_DOTS)
+                axis.scatter(np.full(len(values), x), values, **_DOT_STYLE)
             if level.has_interval:
-                axis.vlines(x + 0.25 * width, *level.ends, **_INTERVAL)
+                axis.vlines(x + 0.25 * width, *level.ends, **_INTERVAL_STYLE)
             if e.num_failed:
                 cross = {"marker": "X", "s": 26, "edgecolors": "white", "lw": 0.5}
                 cross["color"] = FAILED if len(values) else shade
                 bottom = axis.get_xaxis_transform()
                 axis.scatter(x, 0.035, transform=bottom, zorder=4, **cross)
-    crowded = len(groups) > 2 and len(policies) < _ROOMY
-    slanted = {"rotation": 25, "ha": "right"} if crowded else {}
-    axis.set_xticks(range(len(groups)), list(map(label_text, groups)), **slanted)
+    is_crowded = len(groups) > 2 and len(policies) < _WIDE_GROUP
+    slant = {"rotation": 25, "ha": "right"} if is_crowded else {}
+    axis.set_xticks(range(len(groups)), list(map(label_text, groups)), **slant)
     axis.set_xlim(-0.55, len(groups) - 0.45)
     axis.grid(axis="x", visible=False)

@@ -1,7 +1,7 @@
-"""Options of the learning algorithms: which there are, their bounds and meanings.
+"""Options of the learning algorithms, with their bounds and meanings.
 
-A number beyond its bound would become nan, or fill the memory, in the midst of a training; it is
-refused before one.
+A number beyond its bound would become nan or fill the memory during a training, so it is refused
+before.
 """
 
 from collections.abc import Mapping
@@ -14,7 +14,7 @@ from elastic_env.core.config import Model, quantity
 CONSTANTS = "CMA-ES"
 """Algorithm that searches constants instead of training a network."""
 
-_OURS = {
+_SET_BY_TRAINING = {
     "policy": "the network is an MlpPolicy; policy_kwargs has its parameters",
     "env": "the configuration's env and scenarios name the worlds",
     "device": "training runs on the CPU, so that a resumed run ends with the same weights",
@@ -23,10 +23,9 @@ _OURS = {
     "tensorboard_log": "TensorBoard's files go to the folder of the training seed",
     "_init_setup_model": "the model is built whole",
 }
-"""Arguments of the algorithms that are no options, and what stands in their place."""
+"""Arguments of the algorithms that are no options, and what is used instead."""
 
 _LARGEST_WEIGHT = 1e3
-
 
 _Width = Annotated[int, Field(ge=1, le=4096)]
 _Widths = Annotated[list[_Width], Field(max_length=16)]
@@ -58,10 +57,9 @@ class _Options(Model):
 
     @model_validator(mode="before")
     @classmethod
-    def _none_is_set_by_us(cls, values: Any) -> Any:
-        given = [name for name in _OURS if name in values]
-        if given:
-            cures = [f"leave out {name!r}: {_OURS[name]}" for name in given]
+    def _refuse_set_by_training(cls, values: Any) -> Any:
+        cures = [f"leave out {n!r}: {text}" for n, text in _SET_BY_TRAINING.items() if n in values]
+        if cures:
             raise ValueError("; ".join(cures))
         return values
 
@@ -98,7 +96,7 @@ class _SACNetwork(_NetworkOptions):
     clip_mean: float = quantity("1", 2.0, ge=0, le=100)
     """Bound of the mean before tanh."""
     n_critics: int = quantity("1", 2, ge=1, le=16)
-    """Critics."""
+    """Number of critics."""
 
 
 class _OnPolicy(_Options):
@@ -137,7 +135,7 @@ class _PPO(_OnPolicy):
 
 
 class _A2C(_OnPolicy):
-    """Options of A2C; left out, they are those of stable_baselines3 and not these defaults."""
+    """Options of A2C; the defaults of stable_baselines3 apply instead of these."""
 
     rms_prop_eps: float = quantity("1", 1e-5, ge=1e-12, le=1)
     """Smallest divisor of the optimiser."""
@@ -152,19 +150,19 @@ class _SAC(_Options):
     batch_size: int = quantity("1", 512, ge=1, le=10**7)
     """Decisions in a minibatch."""
     buffer_size: int = quantity("1", 200_000, ge=1, le=10**7)
-    """Decisions that are kept."""
+    """Decisions in the replay buffer."""
     learning_starts: int = quantity("1", 2_000, ge=0, le=10**9)
     """Decisions before the first update."""
     train_freq: int = quantity("1", 4, ge=1, le=10**6)
     """Decisions of every world between updates."""
     gradient_steps: int = quantity("1", 8, ge=-1, le=10_000)
-    """Steps of an update, -1: as decisions."""
+    """Steps of an update; -1: one per decision."""
     tau: float = quantity("1", 0.005, ge=0, le=1)
-    """Share of the critic that its target takes on."""
+    """Share of the critic in a change of its target."""
     target_update_interval: int = quantity("1", 1, ge=1, le=10**6)
     """Steps between changes of the target."""
     target_entropy: Literal["auto"] | Annotated[float, Field(ge=-1e6, le=1e6)] = "auto"
-    """Entropy at which a learned weight aims."""
+    """Target of the entropy for a learned weight."""
     n_steps: int = quantity("1", 1, ge=1, le=1000)
     """Decisions of a return."""
     policy_kwargs: _SACNetwork = _SACNetwork()
@@ -179,25 +177,25 @@ class _CMAES(Model):
     """First standard deviation of the residual in ±1."""
 
 
-class _OnesOwn(_Options, extra="allow"):
-    """Options of a class of one's own, which itself checks those that are not among these."""
+class _UserOptions(_Options, extra="allow"):
+    """Options of a user's class, which itself checks those that are not among these."""
 
 
 MODELS = {"A2C": _A2C, "PPO": _PPO, "SAC": _SAC, CONSTANTS: _CMAES}
 """Options by the name of the algorithm."""
 
 
-def checked_options(algorithm: str, options: Mapping[str, Any]) -> dict[str, Any]:
-    """Options of an algorithm, within their bounds; those that are left out stay so.
+def validate_options(algorithm: str, options: Mapping[str, Any]) -> dict[str, Any]:
+    """Check the options of an algorithm, and return them without adding defaults.
 
     Raises:
         ModelError: One does not exist, is set by the training itself, or is beyond its bound.
     """
-    return MODELS.get(algorithm, _OnesOwn)(**options).model_dump(exclude_unset=True)
+    return MODELS.get(algorithm, _UserOptions)(**options).model_dump(exclude_unset=True)
 
 
 def complete_options(algorithm: str, options: Mapping[str, Any]) -> dict[str, Any]:
-    """Options of an algorithm with our defaults; A2C and a class of one's own keep theirs."""
+    """Add our defaults to the options of an algorithm; A2C and a user's class keep their own."""
     if algorithm not in ("PPO", "SAC", CONSTANTS):
         return dict(options)
     return MODELS[algorithm](**options).model_dump()

@@ -1,8 +1,8 @@
-"""A checkpoint: a folder that is written whole or not at all, and read only if it is whole.
+"""A checkpoint: a folder that is written completely or not at all, and read only if complete.
 
-Its files are listed with their SHA-256 digests, which are checked before anything is loaded. A
-digest tells damage from a full disk or a failing one; it is no seal against somebody who writes
-both.
+It lists its files with their SHA-256 digests, which are checked before anything is loaded. A digest
+detects damage by a full or failing disk. It does not protect against an attacker who changes files
+and digests.
 """
 
 import json
@@ -21,116 +21,116 @@ from elastic_env.core.signals import Array
 
 _DIGESTS = "sha256.json"
 _MOST_BYTES = 2 * 10**9
-"""Size of a file of a checkpoint, such as a replay buffer."""
-_ARRAY = "array"
+"""Largest size of a file of a checkpoint, such as a replay buffer."""
+_ARRAY_KEY = "array"
 
 
 @contextmanager
 def write_checkpoint(checkpoint: Path) -> Iterator[Path]:
-    """A fresh folder, which takes the checkpoint's place when all of its files are on the disk.
+    """Yield a new folder, which replaces the checkpoint when all of its files are on the disk.
 
-    A kill between its steps loses nothing, once `recover_checkpoint` was called; a failure leaves
-    the old one.
+    A kill between the steps loses nothing: `recover_checkpoint` completes them. An error keeps the
+    old checkpoint.
     """
-    fresh = _beside(checkpoint, "new")
-    old = _beside(checkpoint, "old")
-    shutil.rmtree(fresh, ignore_errors=True)
-    fresh.mkdir(parents=True)
-    yield fresh
-    text = json.dumps(_digests(fresh), indent=2)
-    (fresh / _DIGESTS).write_text(f"{text}\n", encoding="utf-8")
-    for file in fresh.iterdir():
+    new = _sibling(checkpoint, "new")
+    old = _sibling(checkpoint, "old")
+    shutil.rmtree(new, ignore_errors=True)
+    new.mkdir(parents=True)
+    yield new
+    text = json.dumps(_file_digests(new), indent=2)
+    (new / _DIGESTS).write_text(f"{text}\n", encoding="utf-8")
+    for file in new.iterdir():
         flush(file)
-    flush(fresh)
+    flush(new)
     shutil.rmtree(old, ignore_errors=True)
     if checkpoint.exists():
         checkpoint.rename(old)
-    fresh.rename(checkpoint)
+    new.rename(checkpoint)
     flush(checkpoint.parent)
     shutil.rmtree(old, ignore_errors=True)
 
 
 def recover_checkpoint(checkpoint: Path) -> bool:
-    """True if there is a checkpoint, also after a kill between the moves of `write_checkpoint`."""
-    old = _beside(checkpoint, "old")
+    """Recover from a kill during `write_checkpoint`; return True if there is a checkpoint."""
+    old = _sibling(checkpoint, "old")
     if not checkpoint.exists() and old.exists():
         old.rename(checkpoint)
     return checkpoint.exists()
 
 
-def require_whole(checkpoint: Path) -> None:
+def require_complete(checkpoint: Path) -> None:
     """Check that the files are those that were written.
 
     Raises:
-        ElasticError: One is missing, of another content, or not of this checkpoint.
+        ElasticError: A file is missing, has another content, or does not belong to it.
     """
     try:
-        digests = json.loads(read_bounded(checkpoint / _DIGESTS, LARGEST_JSON))
-        found = _digests(checkpoint)
+        expected = json.loads(read_bounded(checkpoint / _DIGESTS, LARGEST_JSON))
+        actual = _file_digests(checkpoint)
     except (OSError, ValueError, RecursionError) as error:
         raise damage_error(checkpoint, f"{_DIGESTS}: {error}") from None
-    if not isinstance(digests, dict):
+    if not isinstance(expected, dict):
         raise damage_error(checkpoint, f"{_DIGESTS} is no table of files")
-    for name in sorted(digests.keys() | found.keys()):
-        if name not in found:
+    for name in sorted(expected.keys() | actual.keys()):
+        if name not in actual:
             raise damage_error(checkpoint, f"{name} is missing")
-        if name not in digests:
-            raise damage_error(checkpoint, f"{name} is not of it")
-        if digests[name] != found[name]:
+        if name not in expected:
+            raise damage_error(checkpoint, f"{name} does not belong to it")
+        if expected[name] != actual[name]:
             problem = f"the content of {name} is not what was written"
             raise damage_error(checkpoint, problem)
 
 
-def damage_error(checkpoint: Path, why: object) -> ElasticError:
-    """The error of a checkpoint that cannot be gone on with."""
+def damage_error(checkpoint: Path, problem: object) -> ElasticError:
+    """The error for a checkpoint that a training cannot continue from."""
     return ElasticError(
-        f"the checkpoint {shorten(checkpoint)} is damaged or not whole ({why}); remove it to"
-        " begin this seed anew"
+        f"the checkpoint {shorten(checkpoint)} is damaged or incomplete ({problem}); remove it to"
+        " start this seed again"
     )
 
 
-def _beside(checkpoint: Path, ending: str) -> Path:
+def _sibling(checkpoint: Path, ending: str) -> Path:
     return checkpoint.with_name(f"{checkpoint.name}.{ending}")
 
 
-def _digests(checkpoint: Path) -> dict[str, str]:
-    """SHA-256 of every file but their table."""
-    found = {}
+def _file_digests(checkpoint: Path) -> dict[str, str]:
+    """SHA-256 of every file, without the file of digests."""
+    digests = {}
     for file in sorted(checkpoint.iterdir()):
         if file.name != _DIGESTS:
             if (size := file.stat().st_size) > _MOST_BYTES:
                 most = f"at most {_MOST_BYTES:.0e} bytes"
                 raise ValueError(f"{shorten(file.name)} must have {most}, not {size:g}")
-            found[file.name] = digest_of(file)
-    return found
+            digests[file.name] = digest_of(file)
+    return digests
 
 
 def write_state(folder: Path, name: str, state: Any) -> None:
     """Write a state as `name.npz` and `name.json`."""
     arrays: dict[str, Array] = {}
 
-    def plain(value: Any) -> Any:
+    def to_json(value: Any) -> Any:
         if isinstance(value, np.ndarray):
             arrays[key := f"a{len(arrays)}"] = value
-            return {_ARRAY: key}
+            return {_ARRAY_KEY: key}
         if isinstance(value, dict):
-            return {name: plain(part) for name, part in value.items()}
-        return [plain(part) for part in value] if isinstance(value, list) else value
+            return {name: to_json(part) for name, part in value.items()}
+        return [to_json(part) for part in value] if isinstance(value, list) else value
 
-    text = json.dumps(plain(state))
+    text = json.dumps(to_json(state))
     np.savez(folder / f"{name}.npz", **arrays)  # type: ignore[arg-type]
     (folder / f"{name}.json").write_text(text)
 
 
 def read_state(folder: Path, name: str) -> Any:
-    """A state that `write_state` wrote; runs no code from the files."""
+    """Read a state that `write_state` wrote; no code from the files is run."""
     with np.load(folder / f"{name}.npz", allow_pickle=False) as arrays:
 
-        def whole(value: Any) -> Any:
+        def from_json(value: Any) -> Any:
             if isinstance(value, dict):
-                if set(value) == {_ARRAY}:
-                    return arrays[value[_ARRAY]]
-                return {name: whole(part) for name, part in value.items()}
-            return [whole(part) for part in value] if isinstance(value, list) else value
+                if set(value) == {_ARRAY_KEY}:
+                    return arrays[value[_ARRAY_KEY]]
+                return {name: from_json(part) for name, part in value.items()}
+            return [from_json(part) for part in value] if isinstance(value, list) else value
 
-        return whole(json.loads((folder / f"{name}.json").read_text()))
+        return from_json(json.loads((folder / f"{name}.json").read_text()))

@@ -1,8 +1,7 @@
-"""The cheap rival of a learned policy: constant residuals, found by CMA-ES.
+"""A simple rival of a learned policy: constant residuals, optimised by CMA-ES.
 
-They have the same budget of decisions. Constants know nothing of the phase of the walk nor of any
-measurement, but there is nothing to explore wrongly. What a policy gains over them comes from what
-it sees.
+They have the same budget of decisions. Constants depend neither on the phase of the walk nor on any
+measurement, but they are easy to search. A policy that is better gains from its observations.
 """
 
 import json
@@ -19,25 +18,23 @@ from train.learn.algorithm_options import complete_options
 from train.learn.train_config import first_episode, joints_of, training_worlds
 from train.learn.trainer import Trainer, require_finite
 
-_TOLD = "told.json"
+_COSTS = "told.json"
+"""File of the costs of all generations."""
 _FALL_COST = 1e6
-"""Cost of an episode that fails, beyond any sum of rewards: one that ends early also ends its
-penalties.
-"""
+"""Cost of a failed episode, beyond any sum of rewards, since an early end also ends penalties."""
 
 
 class ConstantSearch(Trainer):
     """One training seed of a search, in a folder of its own.
 
     All candidates of a generation play the same episodes, as many in every scenario as the worlds
-    allow, and are told the mean sum of rewards; who falls comes behind all who do not. The policy
-    is the mean of the distribution.
+    allow. The cost is minus the mean sum of rewards. A candidate that falls ranks behind all that
+    do not. The policy is the mean of the distribution.
 
     Args:
-        config: What is searched for; its algorithm_options may be population_size and sigma, in
-            residuals.
+        config: Configuration; its algorithm_options may be population_size and sigma, in residuals.
         seed: Training seed.
-        folder: Where its files go; one with a checkpoint is gone on with.
+        folder: Folder for its files; a search with a checkpoint continues from it.
         threads: Threads of the physics, 0 for all cores; the result does not depend on it.
 
     Raises:
@@ -64,7 +61,7 @@ class ConstantSearch(Trainer):
         bounds = np.tile([-1.0, 1.0], (num_constants, 1))
         mean = np.zeros(num_constants)
         self._optimiser = CMA(mean, bounds=bounds, seed=self._seed, **options)
-        self._told: list[list[float]] = []
+        self._costs: list[list[float]] = []
         self._done = 0
 
     @property
@@ -76,13 +73,13 @@ class ConstantSearch(Trainer):
         candidates = self._ask()
         self._tell(candidates, self._play(candidates))
 
-    def _write(self, checkpoint: Path) -> None:
-        """Write the costs that the search was told: from its seed and these, its state follows."""
-        told = {"decisions": self.done, "best": self._best, "told": self._told}
-        (checkpoint / _TOLD).write_text(json.dumps(told), encoding="utf-8")
+    def _write_state(self, checkpoint: Path) -> None:
+        """Write the costs of all generations; with the seed they define the state of the search."""
+        state = {"decisions": self.done, "best": self._best, "told": self._costs}
+        (checkpoint / _COSTS).write_text(json.dumps(state), encoding="utf-8")
 
-    def _read(self, checkpoint: Path) -> None:
-        state = json.loads((checkpoint / _TOLD).read_text(encoding="utf-8"))
+    def _read_state(self, checkpoint: Path) -> None:
+        state = json.loads((checkpoint / _COSTS).read_text(encoding="utf-8"))
         for costs in state["told"]:
             self._tell(self._ask(), np.array(costs))
         self._done = state["decisions"]
@@ -94,18 +91,17 @@ class ConstantSearch(Trainer):
 
     def _tell(self, candidates: Array, costs: Array) -> None:
         self._optimiser.tell(list(zip(candidates, costs.tolist(), strict=True)))
-        self._told.append(costs.tolist())
+        self._costs.append(costs.tolist())
 
     def _play(self, candidates: Array) -> Array:
-        """Cost of each candidate: minus its mean sum of rewards, and falls, (population,)."""
+        """Play candidates; return their costs, minus the mean sum of rewards, (population,)."""
         n = self._worlds.num_envs
         scenarios = len(self.config.scenarios)
-        generation = len(self._told)
-        own = self._first + generation * self._episodes + np.arange(self._episodes)
-        self._worlds.reset(seed=np.tile(own, n // self._episodes).tolist())
+        generation = len(self._costs)
+        seeds = self._first + generation * self._episodes + np.arange(self._episodes)
+        self._worlds.reset(seed=np.tile(seeds, n // self._episodes).tolist())
         # worlds in the order scenario, candidate, episode
-        of_one = np.repeat(candidates, self._episodes, axis=0)
-        residuals = np.tile(of_one, (scenarios, 1))
+        residuals = np.tile(np.repeat(candidates, self._episodes, axis=0), (scenarios, 1))
         total = np.zeros(n)
         alive = np.ones(n, dtype=np.bool_)
         while alive.any():

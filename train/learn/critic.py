@@ -1,4 +1,4 @@
-"""A policy of Stable-Baselines3 whose critic sees more than its actor: the true robot.
+"""A policy of Stable-Baselines3 whose critic also sees the true robot, unlike its actor.
 
 [Pinto2018] L. Pinto et al., "Asymmetric Actor Critic for Image-Based Robot Learning", RSS.
 """
@@ -11,8 +11,8 @@ from stable_baselines3.common.torch_layers import MlpExtractor
 from typing_extensions import override
 
 
-class _Networks(MlpExtractor):
-    """Hidden layers of actor and critic; those of the actor take the first features alone."""
+class _HiddenLayers(MlpExtractor):
+    """Hidden layers of actor and critic; the actor's have only the first features as input."""
 
     def __init__(self, actor_features: int, num_features: int, *arguments: Any) -> None:
         super().__init__(num_features, *arguments)
@@ -24,12 +24,12 @@ class _Networks(MlpExtractor):
         return super().forward_actor(features[:, : self._actor_features])
 
 
-class KnowingCritic(ActorCriticPolicy):
+class AsymmetricPolicy(ActorCriticPolicy):
     """`MlpPolicy` whose actor does not see the last columns of the observation.
 
     Args:
-        actor_features: Columns that it sees, the first ones.
-        *arguments, **options: As of `ActorCriticPolicy`.
+        actor_features: Number of columns that the actor sees, from the first.
+        *arguments, **options: Arguments of `ActorCriticPolicy`.
     """
 
     def __init__(self, *arguments: Any, actor_features: int, **options: Any) -> None:
@@ -39,4 +39,4 @@ class KnowingCritic(ActorCriticPolicy):
     @override
     def _build_mlp_extractor(self) -> None:
         options = (self.net_arch, self.activation_fn, self.device)
-        self.mlp_extractor = _Networks(self._actor_features, self.features_dim, *options)
+        self.mlp_extractor = _HiddenLayers(self._actor_features, self.features_dim, *options)

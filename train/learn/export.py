@@ -1,4 +1,4 @@
-"""Algorithms of SB3 by name, and their models as residual folders, which play without torch."""
+"""Algorithms of SB3 by name, and export of their models to folders that play without torch."""
 
 import pickle
 from collections.abc import Iterator, Mapping
@@ -34,18 +34,18 @@ def algorithm_class(name: str) -> Any:
             return named_object(name)
         except ConfigurationError as error:
             raise ConfigurationError(f"algorithm {name!r}: {error}") from error
-    known = ("A2C", "PPO", "SAC")
-    if name not in known:
-        raise unknown_name("algorithm", name, [*known, CONSTANTS, "module:Class"])
+    names = ("A2C", "PPO", "SAC")
+    if name not in names:
+        raise unknown_name("algorithm", name, [*names, CONSTANTS, "module:Class"])
     return getattr(stable_baselines3, name)
 
 
 @contextmanager
-def name_options(algorithm: str, options: Mapping[str, Any]) -> Iterator[None]:
-    """Name algorithm and options in what it raises while it is built from them.
+def explain_option_errors(algorithm: str, options: Mapping[str, Any]) -> Iterator[None]:
+    """Add algorithm and options to errors that it raises while it is built from them.
 
     Raises:
-        ConfigurationError: It does not take them.
+        ConfigurationError: The algorithm does not accept the options.
     """
     try:
         yield
@@ -59,14 +59,14 @@ def name_options(algorithm: str, options: Mapping[str, Any]) -> Iterator[None]:
 
 
 def network_of(model: BaseAlgorithm, normaliser: Any) -> tuple[Tensors, dict[str, Any]]:
-    """Weights of the network that a model acts by deterministically; its activation and output.
+    """Weights of a model's deterministic actor, and its activation and output function.
 
     Args:
-        model: With an actor as PPO and A2C have it, or as SAC and TQC have it.
-        normaliser: The `VecNormalize` of its observations; None for none.
+        model: Model with an actor as in PPO and A2C, or as in SAC and TQC.
+        normaliser: The `VecNormalize` of its observations; None without one.
 
     Raises:
-        ConfigurationError: An actor of another kind.
+        ConfigurationError: The actor is of another kind.
     """
     policy: Any = model.policy
     if hasattr(policy, "mlp_extractor") and hasattr(policy, "action_net"):
@@ -91,25 +91,26 @@ def network_of(model: BaseAlgorithm, normaliser: Any) -> tuple[Tensors, dict[str
     features = tensors["weight0"].shape[1]
     tensors |= {"mean": np.zeros(features), "std": np.ones(features)}
     if normaliser is not None:
-        seen = normaliser.obs_rms  # the actor's columns are the first ones
-        tensors["mean"] = seen.mean[:features].copy()
-        tensors["std"] = np.sqrt(seen.var[:features] + normaliser.epsilon)
+        statistics = normaliser.obs_rms  # the actor's columns are the first ones
+        tensors["mean"] = statistics.mean[:features].copy()
+        tensors["std"] = np.sqrt(statistics.var[:features] + normaliser.epsilon)
     return tensors, {"activation": names[activations.pop()], "output": output}
 
 
-def _joints_that_fit(tensors: Tensors, config: TrainConfig) -> list[str]:
-    """The joints of the robot, if the widths of a network are those that its residual needs."""
+def _require_widths(tensors: Tensors, config: TrainConfig) -> list[str]:
+    """Check that a network has the widths of its residual; return the joints of the robot."""
     worlds = training_worlds(config, [(config.scenarios[0], 1)], 1)
-    sees = worlds.actor_features
-    does = flatdim(worlds.single_action_space)
+    num_features = worlds.actor_features
+    num_residuals = flatdim(worlds.single_action_space)
     joints = joints_of(worlds)
     worlds.close()
     layers = sum(name.startswith("bias") for name in tensors)
-    given = tensors["weight0"].shape[1], len(tensors[f"bias{layers - 1}"])
-    if given != (sees, does):
+    widths = tensors["weight0"].shape[1], len(tensors[f"bias{layers - 1}"])
+    if widths != (num_features, num_residuals):
         raise ConfigurationError(
-            f"the model takes {given[0]} features and gives {given[1]} residuals, a residual on"
-            f" {config.base} of the {config.env} with these settings sees {sees} and gives {does}"
+            f"the model takes {widths[0]} features and gives {widths[1]} residuals, a residual on"
+            f" {config.base} of the {config.env} with these settings sees {num_features} and gives"
+            f" {num_residuals}"
         )
     return joints
 
@@ -121,18 +122,18 @@ def export_zip(
     normaliser: Path | None = None,
     trust_pickle: bool = False,
 ) -> Path:
-    """Turn a model that SB3 saved into a residual folder.
+    """Export a model that SB3 saved to a residual folder.
 
     Args:
         path: Zip of `model.save`.
-        config: What it was trained on: algorithm, base, settings and clip belong to the policy.
+        config: Configuration of the training: algorithm, base, settings and clip of the policy.
         output: Folder to write.
-        normaliser: File of `VecNormalize.save`; None where observations were not normalised.
-        trust_pickle: Both are pickles, and loading a pickle runs code from it.
+        normaliser: File of `VecNormalize.save`; None if observations were not normalised.
+        trust_pickle: True to load both files, which are pickles: loading runs code from them.
 
     Raises:
-        ConfigurationError: A teacher, pickles that are not trusted, no model, or one that does not
-            fit the configuration.
+        ConfigurationError: The model is a teacher, its pickles are not trusted, it is missing, or
+            it does not fit the configuration.
     """
     if config.settings.privileged:
         raise ConfigurationError(
@@ -153,11 +154,11 @@ def export_zip(
         tensors, network = network_of(model, statistics)
     except ConfigurationError:
         raise
-    except Exception as error:  # whatever a pickle of something else leads to
+    except Exception as error:  # a pickle of something else may raise anything
         files = " with ".join(map(str, filter(None, (path, normaliser))))
         problem = f"{files} is no model that SB3's {config.algorithm} saved: {error}"
         raise ConfigurationError(problem) from error
-    joints = _joints_that_fit(tensors, config)
+    joints = _require_widths(tensors, config)
     recorded = config.model_dump(mode="json")
     training = {"config": recorded, **provenance(None), "exported_from": path.name}
     description = config.description(joints, training=training, **network)

@@ -21,23 +21,24 @@ from train.evaluate.rollout import make_shared_env, shared_settings
 
 
 class MixedVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
-    """The worlds of several vector environments, one environment's after the other's.
+    """The worlds of several vector environments, one environment after the other.
 
-    A policy costs hardly more for all of them than for those of one. The environments step side by
-    side on threads, while the physics of one runs without Python: give each one thread of physics,
-    and more to those for which no other is left to step beside. The results do not depend on it.
+    One call of a policy for all worlds costs hardly more than for one environment. The environments
+    step in parallel on threads, since the physics runs without Python. Give each environment one
+    thread of physics, and more to the last ones if they would leave cores idle. The results do not
+    depend on it.
 
-    Worlds that end are begun anew by who wraps this, with options["reset_mask"].
+    A wrapper resets worlds that end, with options["reset_mask"].
 
     Args:
-        envs: Vector environments of ours with `autoreset_mode=DISABLED`, of the same task in
-            different scenarios.
-        num_threads: Environments that step at a time, 0 for as many as there are cores.
+        envs: Vector environments of this package with `autoreset_mode=DISABLED`, of the same task
+            in different scenarios.
+        num_threads: Environments that step at the same time, 0 for the number of cores.
         weights: Factor of every world's rewards; None for equal ones.
 
     Raises:
-        ConfigurationError: None, different observations, tasks, motions or assumed joints, another
-            autoreset mode, or not one weight per world.
+        ConfigurationError: There is no environment; they differ in observations, tasks, motions or
+            assumed joints; another autoreset mode; or not one weight per world.
     """
 
     def __init__(
@@ -51,25 +52,24 @@ class MixedVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         self.envs: list[Any] = [env.unwrapped for env in envs]
         for env in self.envs:
             if (mode := env.autoreset_mode) is not AutoresetMode.DISABLED:
-                raise _differ(f"have autoreset_mode Disabled, got {mode.value}")
+                raise _mixture_error(f"have autoreset_mode Disabled, got {mode.value}")
             if env.single_observation_space != self.envs[0].single_observation_space:
-                raise _differ("have the same observation")
-            own = (env.task.name, env.task.num_steps)
-            if own != (self.task.name, self.task.num_steps):
-                raise _differ("have the same task and motion")
+                raise _mixture_error("have the same observation")
+            if (env.task.name, env.task.num_steps) != (self.task.name, self.task.num_steps):
+                raise _mixture_error("have the same task and motion")
             if env.assumed_model.joints != self.assumed_model.joints:
-                raise _differ(
+                raise _mixture_error(
                     "let a policy assume the same joints: give them the same stiffness, and keep"
                     ' scenarios with "ideal", where no friction is assumed, apart from the others'
                 )
-        self._threads = ThreadPoolExecutor(min(_cores(num_threads), len(envs)))
+        self._threads = ThreadPoolExecutor(min(_num_cores(num_threads), len(envs)))
         ends = np.cumsum([0, *(env.num_envs for env in envs)]).tolist()
         self._worlds = [slice(*span) for span in pairwise(ends)]
         n = self.num_envs = ends[-1]
         self._weights = np.ones(n) if weights is None else np.array(weights)
         if self._weights.shape != (n,):
-            got = len(self._weights)
-            raise ConfigurationError(f"weights must be one per world, {n}, got {got}")
+            count = len(self._weights)
+            raise ConfigurationError(f"weights must be one per world, {n}, got {count}")
         self.autoreset_mode = AutoresetMode.DISABLED
         self.metadata = {"autoreset_mode": self.autoreset_mode}
         self.single_observation_space = envs[0].single_observation_space
@@ -79,7 +79,7 @@ class MixedVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
 
     @property
     def assumed_model(self) -> RobotModel:
-        """The robot as a compensator may know it; the same in all environments."""
+        """The robot that compensators assume, the same in all environments."""
         return self.envs[0].assumed_model
 
     @property
@@ -99,18 +99,18 @@ class MixedVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
             seeds = [int(seed) + i for i in range(self.num_envs)]
         mask = reset_mask(options, self.num_envs)
 
-        def begun(env: Any, worlds: slice) -> Array:
+        def begin(env: Any, worlds: slice) -> Array:
             if not mask[worlds].any():
                 return np.asarray(env.task.observe())
-            own = None if seeds is None else list(seeds[worlds])
-            observation, _ = env.reset(seed=own, options={"reset_mask": mask[worlds]})
+            env_seeds = None if seeds is None else list(seeds[worlds])
+            observation, _ = env.reset(seed=env_seeds, options={"reset_mask": mask[worlds]})
             return np.asarray(observation)
 
-        return np.concatenate(self._side_by_side(begun)), {}
+        return np.concatenate(self._run_parallel(begin)), {}
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        """One step in every world; the info is that of worlds that end."""
-        results = self._side_by_side(lambda env, worlds: env.step(actions[worlds]))
+        """Step every world; the info contains only worlds that end."""
+        results = self._run_parallel(lambda env, worlds: env.step(actions[worlds]))
         *parts, infos = zip(*results, strict=True)
         observation, reward, terminated, truncated = map(np.concatenate, parts)
         ended = terminated | truncated
@@ -123,8 +123,9 @@ class MixedVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         for env in self.envs:
             env.close(**kwargs)
 
-    def _side_by_side(self, function: Callable[[Any, slice], Any]) -> list[Any]:
-        if len(self.envs) == 1:  # nothing to wait for in another thread
+    def _run_parallel(self, function: Callable[[Any, slice], Any]) -> list[Any]:
+        """Call a function with every environment and its worlds, on threads."""
+        if len(self.envs) == 1:
             return [function(self.envs[0], self._worlds[0])]
         return list(self._threads.map(function, self.envs, self._worlds))
 
@@ -148,35 +149,35 @@ def mixed_env(
     num_threads: int = 0,
     weights: Sequence[float] | None = None,
 ) -> MixedVectorEnv:
-    """Worlds of several conditions; neighbours that can have an environment in common have one.
+    """Worlds of several conditions; neighbours with the same settings share an environment.
 
     Args:
         conditions: Cells of one environment and motion; their policies are not used.
-        sizes: Worlds of each.
-        num_threads: Threads of the physics, 0 for as many as there are cores.
-        weights: Factor of each one's rewards; None for equal ones.
+        sizes: Number of worlds of each condition.
+        num_threads: Threads of the physics, 0 for the number of cores.
+        weights: Factor of the rewards of each condition; None for equal ones.
 
     Raises:
-        ConfigurationError: A name or an option that does not exist.
+        ConfigurationError: A name or an option does not exist.
     """
-    worlds = [own for own, size in zip(conditions, sizes, strict=True) for _ in range(size)]
-    shares = [list(share) for _, share in groupby(worlds, shared_settings)]
-    threads = threads_of_each(_cores(num_threads), len(shares))
+    worlds = [c for c, size in zip(conditions, sizes, strict=True) for _ in range(size)]
+    groups = [list(group) for _, group in groupby(worlds, shared_settings)]
+    threads = thread_counts(_num_cores(num_threads), len(groups))
     mode = AutoresetMode.DISABLED
-    envs = [make_shared_env(*own, mode) for own in zip(shares, threads, strict=True)]
-    of_worlds = None if weights is None else np.repeat(weights, sizes).tolist()
-    return MixedVectorEnv(envs, num_threads, of_worlds)
+    envs = [make_shared_env(*each, mode) for each in zip(groups, threads, strict=True)]
+    world_weights = None if weights is None else np.repeat(weights, sizes).tolist()
+    return MixedVectorEnv(envs, num_threads, world_weights)
 
 
-def _differ(what: str) -> ConfigurationError:
-    return ConfigurationError(f"all environments of a mixture must {what}")
+def _mixture_error(requirement: str) -> ConfigurationError:
+    return ConfigurationError(f"all environments of a mixture must {requirement}")
 
 
-def _cores(num_threads: int) -> int:
+def _num_cores(num_threads: int) -> int:
     return num_threads or os.cpu_count() or 1
 
 
-def threads_of_each(cores: int, count: int) -> list[int]:
-    """Threads of environments that step side by side: one each, the last ones share the rest."""
+def thread_counts(cores: int, count: int) -> list[int]:
+    """Threads of environments that step in parallel: one each, the last ones share the rest."""
     last = count % cores
     return [1] * (count - last) + [cores // max(last, 1)] * last

@@ -1,12 +1,12 @@
 r"""`python -m train.learn.phase_table`: find the table of the policy `phase_table` in simulation.
 
-The walk is periodic, so its mean error over robots is a sum of harmonics, as the table is. Near the
-table that is played, the harmonics e of the errors follow those u of the table,
+The walk is periodic, so its mean error over robots is a sum of harmonics, as the table is. Near a
+table, the harmonics e of the errors depend on those u of the table,
 
 .. math:: e = e_0 + G u
 
 with a complex matrix G for each harmonic and each of two planes: forward (ZMP, pitch) and sideways
-(ZMP, roll). Two plays with a known u show it. Then u is corrected from play to play as in iterative
+(ZMP, roll). Two plays with a known u identify G. Then every play corrects u as in iterative
 learning control, with a damped inverse of G as the learning gain [Bristow2006],
 
 .. math:: u \leftarrow u - \gamma (G^* G + \lambda)^{-1} G^* e
@@ -50,11 +50,11 @@ _ERRORS = {
     "hip_roll": "pelvis_roll",
 }
 _SCALE = {"zmp_x": 5e-3, "zmp_y": 5e-3, "hip_pitch": 1e-3, "hip_roll": 1e-3}
-"""Errors that weigh the same, and unit of the inputs [m], [rad]."""
-_PROBE = (0.2, 3.0)
-"""Amplitude of the inputs that show the response, in that unit."""
-_DIGITS = 5
-"""Decimals that are kept: 0.01 mm, 0.01 mrad."""
+"""Errors of equal weight, which are the units of errors and inputs [m], [rad]."""
+_PROBE_AMPLITUDES = (0.2, 3.0)
+"""Amplitudes of the inputs that identify the response, in units of `_SCALE`."""
+_DECIMALS = 5
+"""Decimals of a table: 0.01 mm, 0.01 mrad."""
 
 
 class Search(Model):
@@ -67,30 +67,31 @@ class Search(Model):
     robots: int = quantity("1", 24, ge=1, le=256)
     """Robots, whose seeds are 0, 1, ..."""
     strides: int = quantity("1", 2, ge=1, le=100)
-    """Strides of two steps whose errors are averaged, after a first one that is not."""
+    """Strides of two steps whose errors are averaged; one more stride comes first."""
     num_harmonics: int = quantity("1", 4, ge=1, le=MOST_HARMONICS)
     """Harmonics of each of the four inputs."""
     plays: int = quantity("1", 3, ge=1, le=100)
-    """Corrections of the table; every one plays a walk."""
+    """Corrections of the table; each plays a walk."""
     gain: float = quantity("1", 0.8, gt=0, le=1)
     """Learning gain γ."""
     damping: float = quantity("1", 0.02, gt=0)
     """Damping λ of the inverse, where ZMP errors of 5 mm and tilts of 1 mrad are one."""
     output: Path | None = None
-    """File for the table; default the package's own."""
+    """File for the table; default the file of the package."""
 
 
 class Harmonics(NamedTuple):
     """Harmonics of both planes, (planes, count, 2) complex in units of `_SCALE`.
 
-    Real part less i times the sine's is what `PhaseTable` has.
+    The real part is the factor of the cosine in `PhaseTable`, the imaginary part minus that of the
+    sine.
     """
 
     planes: ComplexArray
 
     @classmethod
-    def of(cls, columns: dict[str, Array]) -> Self:
-        """Of cosines and sines, (2 · count,) by the name of the channel."""
+    def from_columns(cls, columns: dict[str, Array]) -> Self:
+        """Convert factors of cosines and sines, (2 · count,) by the name of the channel."""
         planes = []
         for names, _ in _PLANES:
             pairs = [columns[name].reshape(-1, 2) / _SCALE[name] for name in names]
@@ -98,35 +99,36 @@ class Harmonics(NamedTuple):
         return cls(np.array(planes))
 
     def table(self, search: Search) -> PhaseTable:
-        """As a table."""
+        """Return the table with these harmonics."""
         columns: dict[str, Any] = {}
         for (names, _), plane in zip(_PLANES, self.planes, strict=True):
             for i, name in enumerate(names):
                 pairs = _SCALE[name] * np.stack([plane[:, i].real, -plane[:, i].imag], axis=1)
-                columns[name] = np.round(pairs, _DIGITS).tolist()
+                columns[name] = np.round(pairs, _DECIMALS).tolist()
         robots = f"{search.robots} robots of bank 1 in {search.scenario}"
         return PhaseTable(
             step_period_s=search.step_period, found_on=f"foothold, {robots}", **columns
         )
 
 
-def probe(count: int, channel: int) -> Harmonics:
-    """A known table: the same in every harmonic of the ZMP, 0, or of the hips, 1."""
+def probe_inputs(count: int, channel: int) -> Harmonics:
+    """Inputs of equal amplitude in every harmonic of the ZMP (channel 0) or of the hips (1)."""
     planes = np.zeros((2, count, 2), dtype=np.complex128)
-    # phases that keep the sum low, as Schroeder's
     order = np.arange(count)
-    planes[:, :, channel] = _PROBE[channel] * np.exp(-1j * np.pi * order * (order + 1) / count)
+    # Schroeder phases keep the sum low
+    phases = np.exp(-1j * np.pi * order * (order + 1) / count)
+    planes[:, :, channel] = _PROBE_AMPLITUDES[channel] * phases
     return Harmonics(planes)
 
 
-def next_table(
-    now: Harmonics, error: Harmonics, response: ComplexArray, search: Search
+def correct_inputs(
+    inputs: Harmonics, errors: Harmonics, response: ComplexArray, search: Search
 ) -> Harmonics:
-    """The next table, see the module; the response is (planes, count, 2, 2)."""
+    """Return the corrected inputs u, see the module; the response G is (planes, count, 2, 2)."""
     adjoint = response.conj().swapaxes(-1, -2)
     damped = adjoint @ response + search.damping * np.eye(2)
-    step = np.linalg.solve(damped, adjoint @ error.planes[..., None])[..., 0]
-    return Harmonics(now.planes - search.gain * step)
+    step = np.linalg.solve(damped, adjoint @ errors.planes[..., None])[..., 0]
+    return Harmonics(inputs.planes - search.gain * step)
 
 
 class Walks:
@@ -157,7 +159,7 @@ class Walks:
             self._fits.update(dict.fromkeys(names, fit))
 
     def errors(self, table: PhaseTable) -> tuple[Harmonics, dict[str, float]]:
-        """Harmonics of the mean error, and its rms by channel: of robots that did not fall."""
+        """Play a table; return harmonics and rms of the mean error of robots that do not fall."""
         model = self.env.unwrapped.assumed_model
         policy = PhaseFeedforward(baselines.make("foothold", self.env), model, table)
         stands = np.ones(self._search.robots, dtype=np.bool_)
@@ -174,14 +176,14 @@ class Walks:
             columns[name] = self._fits[name] @ errors.mean(axis=1)
             rms[name] = float(np.sqrt((errors**2).mean()))
         rms["fell"] = float((~stands).sum())
-        return Harmonics.of(columns), rms
+        return Harmonics.from_columns(columns), rms
 
 
 class Play(NamedTuple):
-    """What a table left.
+    """Errors that remain with a table.
 
     Attributes:
-        inputs: The table.
+        inputs: Harmonics of the table.
         errors: Harmonics of the mean errors.
         rms: Errors by channel [m], [rad], and the number of robots that `fell`.
     """
@@ -198,8 +200,8 @@ class Play(NamedTuple):
         return sum((self.rms[name] / _SCALE[name]) ** 2 for name in CHANNELS)
 
 
-def find(search: Search) -> PhaseTable:
-    """Find a table, and print the errors of every play; the best one counts."""
+def find_table(search: Search) -> PhaseTable:
+    """Find the best table of all plays, and print the errors of every play."""
     none = Harmonics(np.zeros((2, search.num_harmonics, 2), dtype=np.complex128))
     walks = Walks(search)
     with closing(walks.env):
@@ -213,26 +215,26 @@ def find(search: Search) -> PhaseTable:
         before = play(none, "without")
         response = []
         for channel, title in enumerate(("ZMP", "hips")):
-            known = probe(search.num_harmonics, channel)
-            change = play(known, f"probe of {title}").errors.planes - before.errors.planes
-            response.append(change / known.planes[:, :, channel, None])
+            inputs = probe_inputs(search.num_harmonics, channel)
+            change = play(inputs, f"probe of {title}").errors.planes - before.errors.planes
+            response.append(change / inputs.planes[:, :, channel, None])
         matrix = np.stack(response, axis=-1)
         plays = [before]
         for number in range(search.plays):
             last = plays[-1]
-            now = next_table(last.inputs, last.errors, matrix, search)
-            plays.append(play(now, f"table {number + 1}"))
-    return best(plays).inputs.table(search)
+            inputs = correct_inputs(last.inputs, last.errors, matrix, search)
+            plays.append(play(inputs, f"table {number + 1}"))
+    return best_play(plays).inputs.table(search)
 
 
-def best(plays: Sequence[Play]) -> Play:
-    """The play of the least cost: a correction may be one too many."""
-    return min(plays, key=lambda own: own.cost)
+def best_play(plays: Sequence[Play]) -> Play:
+    """The play with the lowest cost, since a correction may increase the errors."""
+    return min(plays, key=lambda play: play.cost)
 
 
 def main(search: Search) -> None:
     """Find a table, and write it."""
-    table = find(search)
+    table = find_table(search)
     name = f"{round(1000.0 * search.step_period)}ms.json"
     file = search.output or FOLDER / name
     file.parent.mkdir(parents=True, exist_ok=True)

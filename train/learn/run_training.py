@@ -1,4 +1,4 @@
-"""`elastic train`: the training seeds of configurations, in turn or side by side, resumable."""
+"""`elastic train`: the training seeds of configurations, in turn or in parallel, resumable."""
 
 from collections.abc import Sequence
 from contextlib import ExitStack
@@ -26,8 +26,8 @@ from train.workers.pool import Outcome
 
 ONE_BY_ONE = Executors(jobs=1)
 """Seeds in turn, in this process, with all cores for the physics of each."""
-_PATIENCE_S = 60.0
-"""How long the program that works on a training seed is waited for."""
+_LOCK_TIMEOUT_S = 60.0
+"""Longest wait for another program that works on the same training seed [s]."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class Run:
 
     @property
     def is_complete(self) -> bool:
-        """True if all training seeds have come to their end."""
+        """True if all training seeds are complete."""
         seeds = self.config.seeds
         return all(_is_complete(self.folder / f"seed_{seed}") for seed in seeds)
 
@@ -53,29 +53,30 @@ def start(
     """Train all seeds of some configurations, each in a new run.
 
     Args:
-        configs: What is trained.
-        console: Where progress and results go.
-        output: Folder, new or empty; of several configurations each has a folder in it by its name.
+        configs: Configurations.
+        console: Console for progress and results.
+        output: Folder, new or empty; several configurations have folders in it by their names.
             Default runs/<name>, numbered if taken.
-        executors: Where seeds are trained, and how many at a time; the weights do not depend on it.
+        executors: Place of the training of seeds, and number at a time; the weights do not depend
+            on it.
 
     Returns:
-        The runs' folders; there is none where nothing could begin.
+        The runs' folders. No folder stays if nothing could begin.
 
     Raises:
-        ConfigurationError: Names or options that do not exist.
-        ResultsExistError: The output folder holds results.
+        ConfigurationError: A name or an option does not exist.
+        ResultsExistError: The output folder has results.
     """
     runs = list[Run]()
-    with ExitStack() as held:
+    with ExitStack() as locks:
         for config in configs:
-            own = output
+            path = output
             if output is not None and len(configs) > 1:
-                own = output / require_name(config.name)
+                path = output / require_name(config.name)
             recorded = config.model_dump(mode="json")
-            made = run_folder(config.name, recorded, config.seeds[0], own)
-            runs.append(Run(config, held.enter_context(made)))
-            held.enter_context(lock_run(runs[-1].folder))
+            folder = run_folder(config.name, recorded, config.seeds[0], path)
+            runs.append(Run(config, locks.enter_context(folder)))
+            locks.enter_context(lock_run(runs[-1].folder))
         _train(runs, console, executors)
     return [run.folder for run in runs]
 
@@ -86,24 +87,24 @@ def resume(
     executors: Executors = ONE_BY_ONE,
     trust_code: bool = False,
 ) -> list[Path]:
-    """Go on with runs that were interrupted or killed; seeds that are complete stay as they are.
+    """Resume runs that were interrupted or killed; complete seeds do not change.
 
     Args:
-        folders: Of the runs.
-        console: Where progress and results go.
-        executors: Where seeds are trained, and how many at a time.
-        trust_code: Whether an algorithm of one's own, "module:Class", may be imported: its code may
-            lie in a folder.
+        folders: Folders of the runs.
+        console: Console for progress and results.
+        executors: Place of the training of seeds, and number at a time.
+        trust_code: True to import a user's algorithm, "module:Class", whose code may be in a
+            folder.
 
     Raises:
         ConfigurationError: A folder is no training run, another program works on it, or its
             algorithm is not trusted.
     """
-    configs = [recorded_config(own, TrainConfig, trust_code) for own in folders]
+    configs = [recorded_config(folder, TrainConfig, trust_code) for folder in folders]
     runs = list(map(Run, configs, folders))
-    with ExitStack() as held:
+    with ExitStack() as locks:
         for run in runs:
-            held.enter_context(lock_run(run.folder))
+            locks.enter_context(lock_run(run.folder))
         _train(runs, console, executors)
     return [run.folder for run in runs]
 
@@ -119,26 +120,25 @@ def _train(runs: Sequence[Run], console: Console, executors: Executors) -> None:
     names = [f"seed {seed}" for _, seed in calls]
     if len(runs) > 1:
         names = [f"{run.folder}, seed {seed}" for run, seed in calls]
-    decisions = [run.config.decisions for run, _ in calls]
-    totals = dict(zip(names, decisions, strict=True))
+    totals = {name: run.config.decisions for name, (run, _) in zip(names, calls, strict=True)}
     with show_progress(console, totals, unit="decisions") as show:
         if executors == ONE_BY_ONE:
             for number, (run, seed) in enumerate(calls):
                 _train_seed(run, seed, 0, partial(show, number))
         else:
             threads = executors.threads_per_call(len(calls))
-            given = [(Run(r.config, r.folder.resolve()), seed, threads) for r, seed in calls]
+            arguments = [(Run(r.config, r.folder.resolve()), seed, threads) for r, seed in calls]
             watch = _watch(names, console, show)
-            with executors.open_pool(len(given), runs[0].folder) as pool:
-                # Ctrl-C ends at once: a seed may take hours, and goes on from its checkpoint
-                outcomes = run_calls(_train_seed, given, pool, watch, finishes=False)
-            _raise_first(names, outcomes)
+            with executors.open_pool(len(arguments), runs[0].folder) as pool:
+                # Ctrl-C does not wait: a seed may take hours, and resumes from its checkpoint
+                outcomes = run_calls(_train_seed, arguments, pool, watch, finishes=False)
+            _raise_first_error(names, outcomes)
     for run in runs:
-        console.print(_table(run.config, run.folder))
+        console.print(_score_table(run.config, run.folder))
 
 
 def _watch(names: Sequence[str], console: Console, show: Show) -> Watch:
-    """Show the progress of seeds that are trained side by side."""
+    """Make a watch that shows the progress of seeds in parallel."""
     done = [0] * len(names)
 
     def report(number: int, decisions: int) -> None:
@@ -153,8 +153,8 @@ def _watch(names: Sequence[str], console: Console, show: Show) -> Watch:
     return watch
 
 
-def _raise_first(names: Sequence[str], outcomes: Sequence[Outcome | None]) -> None:
-    """The first error of a seed, when the others have ended."""
+def _raise_first_error(names: Sequence[str], outcomes: Sequence[Outcome | None]) -> None:
+    """Raise the first error of a seed, after the others have ended."""
     for name, outcome in zip(names, outcomes, strict=True):
         if outcome is not None and (error := outcome.error) is not None:
             error.add_note(f"in the training of {name}; the other seeds have ended")
@@ -162,28 +162,28 @@ def _raise_first(names: Sequence[str], outcomes: Sequence[Outcome | None]) -> No
 
 
 def _train_seed(run: Run, seed: int, threads: int, report: Progress) -> None:
-    """Train a seed, or go on with it.
+    """Train a seed, or resume it.
 
-    A worker that has lost its scheduler ends within some seconds. Another one, which takes its seed
-    over, waits for it.
+    A worker that has lost its scheduler ends within some seconds. The worker that takes over its
+    seed waits for that.
     """
     config = run.config
-    own = run.folder / f"seed_{seed}"
+    folder = run.folder / f"seed_{seed}"
     report(0)
-    with lock_part(own, _PATIENCE_S):
-        if not _is_complete(own):
-            training = _trainer(config)(config, seed, own, threads)
-            report(training.done)
-            training.run(lambda done: report(min(done, config.decisions)))
+    with lock_part(folder, _LOCK_TIMEOUT_S):
+        if not _is_complete(folder):
+            trainer = _trainer_class(config)(config, seed, folder, threads)
+            report(trainer.done)
+            trainer.run(lambda done: report(min(done, config.decisions)))
     report(config.decisions)
 
 
-def _is_complete(own: Path) -> bool:
-    """True if a seed's training has come to its end."""
-    return (own / "last").is_dir()
+def _is_complete(folder: Path) -> bool:
+    """True if the training of a seed is complete."""
+    return (folder / "last").is_dir()
 
 
-def _trainer(config: TrainConfig) -> type[Trainer]:
+def _trainer_class(config: TrainConfig) -> type[Trainer]:
     if config.algorithm == CONSTANTS:
         from train.learn.constant_search import ConstantSearch
 
@@ -193,8 +193,8 @@ def _trainer(config: TrainConfig) -> type[Trainer]:
     return Training
 
 
-def _table(config: TrainConfig, folder: Path) -> Table:
-    """Scores of the last policies against their base, on the episodes of the evaluations."""
+def _score_table(config: TrainConfig, folder: Path) -> Table:
+    """Table of the last policies' scores against their base, on the episodes of the evaluations."""
     columns = environment(config.env).judged
     metrics = [column.metric for column in columns]
     head = ["seed", "scenario", *(column.label for column in columns), "failed"]
@@ -203,14 +203,14 @@ def _table(config: TrainConfig, folder: Path) -> Table:
         rows = read_progress(folder / f"seed_{seed}", metrics, ["failed"])
         for row in (row for row in rows if row["decisions"] == rows[-1]["decisions"]):
             both = [(row[f"base_{c.metric}"], row[c.metric], c.scale) for c in columns]
-            changes = [_change(*own) for own in both]
+            changes = [_change_text(*scores) for scores in both]
             table.append([str(seed), row["scenario"], *changes, f"{row['failed']:.0f}"])
     title = f"last policies on {config.base}, on episodes that training never sees"
     return make_table(title, head, table, left=2)
 
 
-def _change(base: float, mine: float, scale: float) -> str:
-    """Two scores and the change between them; - for one of which all episodes failed."""
+def _change_text(base: float, mine: float, scale: float) -> str:
+    """Two scores and their relative change; - for a score if all its episodes failed."""
     scores = [scale * score for score in (base, mine)]
     both = " → ".join(f"{score:.2f}" if isfinite(score) else "-" for score in scores)
     change = mine / base - 1.0 if base else nan

@@ -10,21 +10,21 @@ from stable_baselines3.common.vec_env import VecEnv
 from elastic_env.core.errors import ConfigurationError
 from train.learn.trainer import require_finite
 
-_NOTHING: dict[str, Any] = {}
+_EMPTY_INFO: dict[str, Any] = {}
 
 
 class SB3VecEnv(VecEnv):
     """A Gymnasium vector environment with same-step autoreset as an SB3 `VecEnv`.
 
-    Terminal observations, time limits (`TimeLimit.truncated`) and episode statistics (`episode`:
-    reward r, length l in steps of this environment, and the metrics of the task) are in the infos
-    of the worlds that end, as SB3 reads them. A first episode that is cut short has no statistics:
-    it would count for less reward than a whole one.
+    As SB3 expects, the infos of worlds that end have the terminal observation, the time limit
+    (`TimeLimit.truncated`) and the metrics of the task. They also have the statistics of the
+    `episode`: its reward r, and its length l in steps of this environment. A first episode that is
+    cut short has no statistics, since its sum of rewards is not that of a complete episode.
 
     Args:
-        env: With `autoreset_mode=SAME_STEP`, such as a `ResidualVectorWrapper`.
-        stagger: Generator for an order in which first episodes end early, see
-            `ResidualVectorWrapper.stagger`; None to let all worlds go on in step.
+        env: Environment with `autoreset_mode=SAME_STEP`, such as a `ResidualVectorWrapper`.
+        stagger: Generator for the order in which first episodes end early, see
+            `ResidualVectorWrapper.stagger`; None to begin all worlds in step.
 
     Raises:
         ConfigurationError: Another autoreset mode.
@@ -37,9 +37,9 @@ class SB3VecEnv(VecEnv):
     ) -> None:
         mode = env.metadata.get("autoreset_mode")
         if mode is not AutoresetMode.SAME_STEP:
-            why = "SB3 restarts worlds in the same step"
-            problem = f"{why}, autoreset_mode must be SameStep, got {mode}"
-            raise ConfigurationError(problem)
+            raise ConfigurationError(
+                f"SB3 restarts worlds in the same step, autoreset_mode must be SameStep, got {mode}"
+            )
         self.env = env
         self._stagger = stagger
         self._actions: Any = None
@@ -64,7 +64,7 @@ class SB3VecEnv(VecEnv):
         self._steps = 0
         return observation
 
-    def begin_with(self, seed: int, stagger: np.random.Generator) -> None:
+    def seed_next_reset(self, seed: int, stagger: np.random.Generator) -> None:
         """Seed the next `reset`, world i with seed + i, and the order of its early ends."""
         self.seed(seed)
         self._stagger = stagger
@@ -74,7 +74,7 @@ class SB3VecEnv(VecEnv):
         self._actions = actions
 
     def step_wait(self) -> tuple[Any, Any, Any, Any]:
-        """One step in every world.
+        """Step every world.
 
         Raises:
             DivergedError: An observation or a reward is not finite.
@@ -87,22 +87,22 @@ class SB3VecEnv(VecEnv):
         self._length += 1
         self._total += float(reward.sum())
         self._steps += self.num_envs
-        # worlds that go on share an empty info: SB3 only reads those that end
-        infos: list[dict[str, Any]] = [_NOTHING] * self.num_envs
+        # other worlds share an empty info, since SB3 reads only those of worlds that end
+        infos: list[dict[str, Any]] = [_EMPTY_INFO] * self.num_envs
         if done.any():
             final = info["final_info"]
             metrics = final.get("episode_metrics", {})
             scored = final.get("_episode_metrics", done)
             for world in np.flatnonzero(done).tolist():
-                ended = metrics if scored[world] else {}
-                own = {name: values[world].item() for name, values in ended.items()}
+                recorded = metrics if scored[world] else {}
+                own_metrics = {name: values[world].item() for name, values in recorded.items()}
                 is_cut = bool(truncated[world] and not terminated[world])
                 infos[world] = {
                     "terminal_observation": info["final_obs"][world],
                     "TimeLimit.truncated": is_cut,
-                    "episode_metrics": own,
+                    "episode_metrics": own_metrics,
                 }
-                if own or self._stagger is None:
+                if own_metrics or self._stagger is None:
                     reward_sum = float(self._reward[world])
                     length = int(self._length[world])
                     infos[world]["episode"] = {"r": reward_sum, "l": length, "t": 0.0}
@@ -125,9 +125,10 @@ class SB3VecEnv(VecEnv):
         return [value for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Worlds have no attributes of their own."""
-        problem = "the worlds of a vector environment have no attributes of their own"
-        raise NotImplementedError(problem)
+        """Refuse: worlds have no attributes of their own."""
+        raise NotImplementedError(
+            "the worlds of a vector environment have no attributes of their own"
+        )
 
     def env_method(
         self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any

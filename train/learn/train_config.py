@@ -26,20 +26,18 @@ from train.evaluate.conditions import (
     require_drawn,
 )
 from train.evaluate.environments import environment
-from train.learn.algorithm_options import CONSTANTS, checked_options
+from train.learn.algorithm_options import CONSTANTS, validate_options
 from train.learn.mixed_env import mixed_env
 from train.runs.user_code import CodeNamingModel, kind_check
 
 FIRST_TRAINING_SEED = 10_000_000
 EVALUATION_SEED = 50_000
-"""Episodes of evaluation begin at the second, those of training at the first: no seed serves
-both.
-"""
+"""Seeds of the first episodes of training and of evaluation, so that they share no seed."""
 _TRAINING_SEED_STRIDE = 100_000
-"""Distance of the episodes of two training seeds."""
-
-
+"""Difference between the first episodes of two training seeds."""
 _MOST_DECISIONS = 10**12
+_WORLD_BYTES = 100_000
+"""Memory of a world, measured on the walker with its policy and on the testbed with a motion."""
 
 
 class TrainConfig(CodeNamingModel):
@@ -52,25 +50,25 @@ class TrainConfig(CodeNamingModel):
     reference: GivenReference | None = None
     """Motion, as in a comparison; None for the environment's default."""
     scenarios: Entries[Title] = ["nominal"]
-    """Scenarios whose worlds are learned from together, in equal shares."""
+    """Scenarios of the training worlds, in equal shares."""
     weights: dict[str, Annotated[float, Field(gt=0, le=1e6)]] = {}
-    """How much the rewards of single scenarios count, at most 10⁶; 1 where nothing is said."""
+    """Weights of the rewards of single scenarios, at most 10⁶; default 1."""
     ranges: GivenRanges = {}
-    """Intervals that the robots of `drawn` are drawn from, in place of its own."""
+    """Intervals that replace those of `drawn`."""
     env_options: EnvOptions = {}
     """Further arguments of the environment, such as the weights of its reward."""
     training_options: EnvOptions = {}
-    """The same for the worlds that are learned from alone, such as a longer physics step."""
+    """The same for the training worlds alone, such as a longer physics step."""
     base: Title = "input_output"
     """Policy that is corrected: a baseline by name, since an exported residual plays without
     code of its own.
     """
     base_options: dict[str, Any] = {}
     settings: ResidualSettings = ResidualSettings()
-    """How the residual acts and what it sees."""
+    """Actions and observations of the residual."""
     critic_sees: Annotated[list[Title], Field(max_length=MOST_ENTRIES)] = []
-    """What the critic sees of the true robot while it learns, for PPO and A2C on a walker
-    (`baselines.residual.true_robot`); the residual does without."""
+    """True quantities of the robot that the critic sees, for PPO and A2C on a walker
+    (`baselines.residual.true_robot`); the residual does not see them."""
     algorithm: Locator = "PPO"
     """Class of stable_baselines3, "module:Class" of one that has the same interface, or "CMA-ES", a
     search over residuals that never change."""
@@ -96,31 +94,29 @@ class TrainConfig(CodeNamingModel):
     A checkpoint ends all episodes: leave several of every world between two.
     """
 
-    _kind = model_validator(mode="before")(kind_check("training"))
-    _checked = field_validator("base")(require_plain_base)
+    _check_kind = model_validator(mode="before")(kind_check("training"))
+    _check_base = field_validator("base")(require_plain_base)
 
     @model_validator(mode="after")
-    def _scenarios_fit(self) -> Self:
+    def _check_scenarios(self) -> Self:
         require_known("scenario with a weight", self.weights, self.scenarios)
         require_drawn(self.scenarios, self.ranges)
         require_known("quantity that a critic sees", self.critic_sees, TRUE_QUANTITIES)
         motion = self.reference if isinstance(self.reference, dict) else {}
         if twice := sorted(motion.keys() & self.training_options.keys()):
             raise ValueError(
-                f"training_options must not say what the reference does: {', '.join(twice)}; name"
-                " in the reference what trainings and evaluations have in common"
+                f"training_options must not repeat keys of the reference: {', '.join(twice)}; set"
+                " in the reference what trainings and evaluations share"
             )
         return self
 
     @field_validator("algorithm_options")
     @classmethod
-    def _options_are_within_their_bounds(
-        cls, options: dict[str, Any], others: ValidationInfo
-    ) -> dict[str, Any]:
-        return checked_options(str(others.data.get("algorithm")), options)
+    def _check_options(cls, options: dict[str, Any], others: ValidationInfo) -> dict[str, Any]:
+        return validate_options(str(others.data.get("algorithm")), options)
 
     @model_validator(mode="after")
-    def _critic_is_one_of_the_state(self) -> Self:
+    def _check_critic(self) -> Self:
         if self.critic_sees and self.algorithm in ("SAC", CONSTANTS):
             raise ValueError(
                 f"critic_sees is for PPO and A2C, whose critic has inputs of its own, got"
@@ -130,11 +126,11 @@ class TrainConfig(CodeNamingModel):
 
     @property
     def names_of_code(self) -> list[str]:
-        """Names that may stand for code; that of the base never does."""
+        """Names that may refer to a user's code; that of the base never does."""
         return [self.algorithm, self.env]
 
     def condition(self, scenario: str, policy: str) -> Condition:
-        """A cell in which a policy is evaluated; where nothing is drawn, it has one episode."""
+        """The cell of an evaluation of a policy, with one episode if nothing is random."""
         options = self.base_options if policy == self.base else {}
         condition = Condition(
             env=self.env,
@@ -152,34 +148,34 @@ class TrainConfig(CodeNamingModel):
     def description(self, joints: list[str], **network: Any) -> ResidualDescription:
         """Description of an exported policy; `network` names its activation and output."""
         names = ("base", "base_options", "settings", "clip")
-        own = {name: getattr(self, name) for name in names}
+        values = {name: getattr(self, name) for name in names}
         robot = environment(self.env).robot
-        return ResidualDescription(robot=robot, joints=joints, **own, **network)
+        return ResidualDescription(robot=robot, joints=joints, **values, **network)
 
-    def is_due(self, every: int, before: int, now: int) -> bool:
-        """True if work that is done every so many decisions, and at the end, is due."""
-        return now // every > before // every or now >= self.decisions
+    def is_due(self, every: int, before: int, done: int) -> bool:
+        """True if work is due that is done every so many decisions, and at the end.
+
+        Args:
+            every: Decisions between two times of the work.
+            before: Decisions before the last step of the training.
+            done: Decisions after it.
+        """
+        return done // every > before // every or done >= self.decisions
 
     @property
     def shares(self) -> list[tuple[str, int]]:
-        """Worlds of each scenario; the first ones take what does not divide.
+        """Number of worlds of each scenario; the first scenarios get the remainder.
 
         Raises:
-            ConfigurationError: Fewer than two for one of them.
+            ConfigurationError: A scenario would have fewer than two.
         """
         count = len(self.scenarios)
         if self.worlds < 2 * count:
             problem = f"worlds must be at least two per scenario, {2 * count}, got {self.worlds}"
             raise ConfigurationError(problem)
-        whole, rest = divmod(self.worlds, count)
-        sizes = [whole + (number < rest) for number in range(count)]
+        share, remainder = divmod(self.worlds, count)
+        sizes = [share + (number < remainder) for number in range(count)]
         return list(zip(self.scenarios, sizes, strict=True))
-
-
-_WORLD_BYTES = 100_000
-"""Memory of a world: measured on the walker with its policy, and on the testbed with a motion of
-its own.
-"""
 
 
 def first_episode(seed: int) -> int:
@@ -188,28 +184,30 @@ def first_episode(seed: int) -> int:
 
 
 def joints_of(worlds: Any) -> list[str]:
-    """Names of the joints of the robot that is trained on."""
+    """Names of the joints of the robot in training worlds."""
     return worlds.unwrapped.assumed_model.joint_names
 
 
 def training_worlds(
     config: TrainConfig, shares: list[tuple[str, int]], threads: int
 ) -> ResidualVectorWrapper:
-    """Worlds under residuals of the configuration's base.
+    """Worlds in which actions are residuals of the configuration's base.
 
     Args:
-        config: What is trained.
-        shares: How many worlds of which scenario.
+        config: Configuration of the training.
+        shares: Scenarios with their numbers of worlds.
         threads: Threads of the physics, 0 for all cores; the results do not depend on it.
 
     Raises:
-        ConfigurationError: A name or an option that does not exist.
+        ConfigurationError: A name or an option does not exist.
     """
     require_memory("worlds", sum(count for _, count in shares), _WORLD_BYTES)
-    conditions = [config.condition(scenario, config.base) for scenario, _ in shares]
-    known = environment(config.env)
-    apart = known.learned_from | config.env_options | config.training_options
-    conditions = [condition.replace(env_options=apart) for condition in conditions]
+    arguments = environment(config.env).training_arguments
+    options = arguments | config.env_options | config.training_options
+    conditions = [
+        config.condition(scenario, config.base).replace(env_options=options)
+        for scenario, _ in shares
+    ]
     weights = [config.weights.get(scenario, 1.0) for scenario, _ in shares]
     sizes = [count for _, count in shares]
     worlds = mixed_env(conditions, sizes, threads, weights)

@@ -1,7 +1,7 @@
-"""Base of all ways of learning: the loop over decisions with evaluations and checkpoints.
+"""Base class of trainings: the loop over decisions with evaluations and checkpoints.
 
-Policies are evaluated on episodes that the training never learns from; the best and the last one
-are kept.
+Policies are evaluated on episodes that the training never uses. The best and the last policy are
+kept.
 """
 
 import shutil
@@ -31,7 +31,7 @@ class DivergedError(ElasticError):
     """A quantity of a training is no longer a finite number.
 
     Args:
-        quantity: What it is, such as the reward.
+        quantity: Its name, such as the reward.
     """
 
     def __init__(self, quantity: str) -> None:
@@ -40,31 +40,30 @@ class DivergedError(ElasticError):
 
 
 def require_finite(quantity: str, values: Any) -> None:
-    """Refuse nan and infinity among the numbers of a training.
+    """Refuse nan and infinity in a quantity of a training.
 
     Raises:
-        DivergedError: There is one.
+        DivergedError: A value is not finite.
     """
     if not np.isfinite(values).all():
         raise DivergedError(quantity)
 
 
 CHECKPOINT = "checkpoint"
-"""Folder, within that of a training seed, to go on from."""
+"""Folder of the checkpoint in the folder of a training seed."""
 Scores = tuple[Array, IntArray]
-"""Means of metrics over the episodes that did not fail, (scenarios, metrics), and how many did,
-(scenarios,).
-"""
+"""Means of metrics over episodes that did not fail, (scenarios, metrics), and numbers of failed
+episodes, (scenarios,)."""
 
 
 class Trainer(ABC):
     """One training seed of a configuration, in a folder of its own.
 
     Args:
-        config: What is trained.
+        config: Configuration of the training.
         seed: Training seed.
-        folder: Where its files go: `progress.csv`, `best/`, `last/` and the checkpoint, with which
-            it goes on.
+        folder: Folder for its files: `progress.csv`, `best/`, `last/` and the checkpoint, from
+            which it resumes.
         threads: Threads of the physics, 0 for all cores; the result does not depend on it.
     """
 
@@ -73,18 +72,18 @@ class Trainer(ABC):
         self.folder = folder
         self._seed = seed
         self._threads = threads
-        self._kept: int | None = None
+        self._checkpoint_decisions: int | None = None
         self._provenance = provenance(seed)
         self._table = ""
         self._base: Scores | None = None
         self._best: float | None = None
-        """Score of the best policy so far: mean ratio to the base, and what falls cost."""
+        """Score of the best policy so far: mean ratio to the base, plus failures per scenario."""
         self._prepare(threads)
         folder.mkdir(parents=True, exist_ok=True)
-        self._go_on()
+        self._resume()
 
     def run(self, progress: Callable[[int], None] | None = None) -> None:
-        """Learn to the end of the configuration's decisions; `progress` is told the decisions done.
+        """Learn until the configuration's decisions are done; `progress` gets the decisions so far.
 
         Raises:
             ElasticError: A quantity is no longer finite; the last checkpoint stays.
@@ -112,50 +111,50 @@ class Trainer(ABC):
         """Decisions so far."""
 
     def checkpoint(self) -> None:
-        """Keep everything that the rest depends on."""
-        with checkpoints.write_checkpoint(self.folder / CHECKPOINT) as fresh:
-            self._write(fresh)
-        self._kept = self.done
+        """Write everything that the rest of the training depends on."""
+        with checkpoints.write_checkpoint(self.folder / CHECKPOINT) as folder:
+            self._write_state(folder)
+        self._checkpoint_decisions = self.done
 
-    def _go_on(self) -> None:
-        """Go on from the checkpoint, if there is one.
+    def _resume(self) -> None:
+        """Resume from the checkpoint, if there is one.
 
         Raises:
-            ElasticError: The checkpoint is not what was written.
+            ElasticError: The checkpoint is damaged.
         """
         path = self.folder / CHECKPOINT
         if checkpoints.recover_checkpoint(path):
-            checkpoints.require_whole(path)
+            checkpoints.require_complete(path)
             try:
-                self._read(path)
+                self._read_state(path)
             except (LookupError, TypeError, ValueError, RuntimeError) as error:
                 raise checkpoints.damage_error(path, f"{type(error).__name__}: {error}") from error
-            self._kept = self.done
-        self._forget_later_scores()
+            self._checkpoint_decisions = self.done
+        self._drop_later_scores()
 
     def _divergence_text(self, quantity: str) -> str:
-        """The sentence for a quantity that is no longer finite."""
+        """Error text for a quantity that is no longer finite."""
         place = shorten(self.folder / CHECKPOINT)
-        kept = f"the checkpoint of decision {self._kept} is kept in {place}"
-        if self._kept is None:
-            kept = f"no checkpoint was due yet (checkpoint_every: {self.config.checkpoint_every})"
+        state = f"the checkpoint of decision {self._checkpoint_decisions} is kept in {place}"
+        if self._checkpoint_decisions is None:
+            state = f"no checkpoint was due yet (checkpoint_every: {self.config.checkpoint_every})"
         return (
             f"{quantity} is not a finite number at decision {self.done} of training seed"
-            f" {self._seed}; {kept}; begin anew with a smaller learning_rate or log_std_init, or"
+            f" {self._seed}; {state}; start again with a smaller learning_rate or log_std_init, or"
             " smaller weights of the reward"
         )
 
     @abstractmethod
     def _prepare(self, threads: int) -> None:
-        """Make the worlds, on some threads, and what learns in them."""
+        """Make the training worlds and the learner; `threads` are those of the physics."""
 
     @abstractmethod
-    def _write(self, checkpoint: Path) -> None:
+    def _write_state(self, checkpoint: Path) -> None:
         """Write everything that the rest depends on as files of a folder."""
 
     @abstractmethod
-    def _read(self, checkpoint: Path) -> None:
-        """Take up what `_write` has written."""
+    def _read_state(self, checkpoint: Path) -> None:
+        """Read the files of `_write_state`."""
 
     @abstractmethod
     def _advance(self) -> None:
@@ -163,13 +162,13 @@ class Trainer(ABC):
 
     @abstractmethod
     def _policy(self) -> tuple[dict[str, Any], ResidualDescription]:
-        """The present policy, as it is exported."""
+        """Tensors and description of the current policy, for its export."""
 
     def _evaluate(self) -> None:
-        """Score the present policy, and keep it where it is the best so far.
+        """Score the current policy, and keep it if it is the best so far.
 
-        A residual begins as its base, within a hundredth of its range: before the first decision
-        the base's score is its own.
+        Before the first decision the residual has the base's score, since it differs from the base
+        by at most a hundredth of its range.
         """
         current = self._keep_policy("current")
         columns = [column.metric for column in environment(self.config.env).judged]
@@ -198,33 +197,33 @@ class Trainer(ABC):
         for name, ratio in zip(columns, ratios.mean(axis=0).tolist(), strict=True):
             if np.isfinite(ratio):
                 changes[f"{name}_change"] = ratio - 1.0
-        self._show(changes)
+        self._log_scores(changes)
 
-    def _show(self, changes: Mapping[str, float]) -> None:  # noqa: B027  who has curves shows them
-        """Show the scores of an evaluation beside the curves of the training.
+    def _log_scores(self, changes: Mapping[str, float]) -> None:  # noqa: B027  optional
+        """Log the scores of an evaluation, in trainings that log curves.
 
         Args:
-            changes: METRIC_change of every judged metric: relative to the base's, [1], mean over
-                the scenarios; negative is better. One is left out where all episodes of a scenario
-                failed. And `failed`: how many did.
+            changes: METRIC_change of every judged metric: change relative to the base [1], mean
+                over the scenarios; negative is better. A metric is left out if all episodes of a
+                scenario failed. And `failed`: the number of failed episodes.
         """
 
     def _keep_policy(self, name: str) -> Path:
-        """Write the present policy as a folder, replacing the one of that name."""
+        """Write the current policy as a folder, replacing the one of that name."""
         tensors, description = self._policy()
         recorded = self.config.model_dump(mode="json")
         training = {"config": recorded, "decisions": self.done, **self._provenance}
-        fresh = self.folder / f"{name}.new"
-        shutil.rmtree(fresh, ignore_errors=True)
-        save_residual(fresh, description.replace(training=training), tensors)
+        new = self.folder / f"{name}.new"
+        shutil.rmtree(new, ignore_errors=True)
+        save_residual(new, description.replace(training=training), tensors)
         shutil.rmtree(self.folder / name, ignore_errors=True)
-        return fresh.rename(self.folder / name)
+        return new.rename(self.folder / name)
 
-    def _forget_later_scores(self) -> None:
-        """Drop evaluations that were made after a checkpoint; they will be made again.
+    def _drop_later_scores(self) -> None:
+        """Drop evaluations after the checkpoint from `progress.csv`; they will be repeated.
 
         Raises:
-            ConfigurationError: Their table is no text, no plain file, or too large.
+            ConfigurationError: The table is no text, no plain file, or too large.
         """
         path = self.folder / PROGRESS
         try:
@@ -233,15 +232,15 @@ class Trainer(ABC):
             return
         try:
             lines = content.decode("utf-8").splitlines(keepends=True)
-            whole = [line for line in lines[1:] if line.endswith("\n")]
-            kept = [line for line in whole if int(line.split(",")[0]) <= self.done]
+            rows = [line for line in lines[1:] if line.endswith("\n")]
+            rows = [row for row in rows if int(row.split(",")[0]) <= self.done]
         except ValueError as error:
             problem = f"{path} is no table of evaluations ({error}); remove it"
             raise ConfigurationError(problem) from None
         if self.done == 0 or not lines:
             path.unlink()
             return
-        self._table = "".join([lines[0], *kept])
+        self._table = "".join([lines[0], *rows])
         write_whole(path, self._table)
 
 
@@ -251,20 +250,20 @@ def play_scenarios(
     """Scores of a policy in every scenario of a training, on the episodes of its evaluations.
 
     Args:
-        config: What is trained.
+        config: Configuration of the training.
         policy: Name of the policy.
         metrics: Names of scores.
         num_threads: Threads, 0 for all cores.
     """
     conditions = [config.condition(scenario, policy) for scenario in config.scenarios]
-    played = {
-        found.condition.scenario: found
-        for own in group_by(conditions, shared_settings).values()
-        for found in evaluate_together(own, num_threads=num_threads)
+    evaluations = {
+        evaluation.condition.scenario: evaluation
+        for group in group_by(conditions, shared_settings).values()
+        for evaluation in evaluate_together(group, num_threads=num_threads)
     }
-    results = [played[scenario] for scenario in config.scenarios]
+    results = [evaluations[scenario] for scenario in config.scenarios]
     means = [
-        [np.mean(some) if len(some) else np.nan for some in map(own.values, metrics)]
-        for own in results
+        [np.mean(values) if len(values) else np.nan for values in map(result.values, metrics)]
+        for result in results
     ]
-    return np.array(means), np.array([own.num_failed for own in results])
+    return np.array(means), np.array([result.num_failed for result in results])

@@ -7,11 +7,12 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from train.evaluate import changes as terms
-from train.evaluate.changes import Change, by_line, percent_interval, signed_interval
+from train.evaluate import terms
+from train.evaluate.changes import Change, group_lines
 from train.evaluate.episodes import group_by
 from train.evaluate.maps import HeatMap
 from train.evaluate.statistics import Estimate, named_intervals
+from train.evaluate.terms import percent_interval, signed_interval
 from train.report.tables import Cell, Head, Part, Row, Table, number_interval
 from train.report.terminal import print_table
 from train.runs.escaping import write_records
@@ -58,7 +59,7 @@ def cells_table(rows: Sequence[Change]) -> Table:
     heads += [Head(column.title, leaves=1) for column in columns]
     heads += [Head(f"{rows[0].failure} ({'other' if rows[0].is_rival else 'base'})")]
     lines = []
-    for line in by_line(rows):
+    for line in group_lines(rows):
         first = line[0]
         scope = " ".join(filter(None, [first.scope, "".join(_signs(first.marks))]))
         labels = [*([] if is_one else [first.policy]), first.reference, scope]
@@ -95,8 +96,9 @@ def changes_table(rows: Sequence[Change], colours: Mapping[str, str]) -> Table:
     for (policy, base), block in group_by(rows, lambda row: (row.policy, row.base)).items():
         number = block[0].num_seeds
         seeds = f", {number} training seed{'s' * (number != 1)}" if is_family else ""
-        lines.append(Row((f"{policy} against {base}{seeds}",), kind="heading", dot=colours[policy]))
-        for row in (row for line in by_line(block) for row in line):
+        title = f"{policy} against {base}{seeds}"
+        lines.append(Row((title,), kind="heading", dot=colours[policy]))
+        for row in (row for line in group_lines(block) for row in line):
             failed = Part(_failures(row), "failure" if row.falls_more else "")
             cells: list[Cell] = [row.reference, _scope(row)]
             cells += [*row.first.swept_values(swept), row.column.title, _means(row)]

@@ -5,11 +5,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from train.evaluate.changes import CEILING, HELD_OUT, Change, by_line, percent_interval
+from train.evaluate.changes import Change, group_lines
 from train.evaluate.environments import Column
 from train.evaluate.episodes import group_by
+from train.evaluate.scores import failures, score
 from train.evaluate.statistics import Estimate
-from train.evaluate.table import EpisodeTable, failures, score
+from train.evaluate.table import EpisodeTable
+from train.evaluate.terms import CEILING, HELD_OUT, percent_interval
 from train.figures.colours import INK, LINE, VERDICTS
 from train.report import specs
 from train.report.specs import LONGEST_NAME, Spec, base_axis
@@ -121,7 +123,7 @@ def ladder(table: EpisodeTable, reference: str, colours: Mapping[str, str]) -> S
                 headings[scenario] = place + (0.5 if headings else 0.0)
                 place = headings[scenario] + 1.0
             if cells:
-                rungs.append((place, policy, table.of(policy, *cells)))
+                rungs.append((place, policy, table.rows_of(policy, *cells)))
                 place += 1.0
     panels = []
     failure = table.environment.failure
@@ -191,7 +193,7 @@ def _heading(text: str, place: float) -> Spec:
 
 def forest(rows: Sequence[Change]) -> Spec:
     """Return the chart of changes of one residual against its base, in all cells."""
-    lines = by_line(rows)
+    lines = group_lines(rows)
     several = len({row.reference for row in rows}) > 1
     names = [f"{row.reference} · {row.scope}" if several else row.scope for row, *_ in lines]
     panels = []

@@ -13,12 +13,12 @@ from rich.console import Console
 from baselines.catalogue import Track
 from elastic_env.core.errors import ConfigurationError, shorten
 from elastic_env.core.files import write_whole
-from train.evaluate.changes import BEST_ANALYTIC, SIGNS_ARE, signed_interval
 from train.evaluate.environments import Column
 from train.evaluate.episodes import group_by
 from train.evaluate.maps import best_of
-from train.evaluate.standings import Paired, Standing
+from train.evaluate.standings import PairedChange, Standing
 from train.evaluate.statistics import Estimate
+from train.evaluate.terms import BEST_ANALYTIC, SIGNS_ARE, signed_interval
 from train.report.page import TEXTS, Page
 from train.report.report_text import capital
 from train.report.tables import Head, Part, Row, Table
@@ -139,8 +139,8 @@ def claims_table(standings: Sequence[Standing]) -> Table:
     for (policy, scope, reference), line in lines.items():
         cells = [policy, f"{scope}, {reference}"]
         for s in line:
-            base = None if s.base is None else s.base.to
-            is_same = s.rival is not None and s.rival.to == base
+            base = None if s.base is None else s.base.opponent
+            is_same = s.rival is not None and s.rival.opponent == base
             cells += [_change(s.base), "the same" if is_same else _change(s.rival)]
         rows.append(cells)
     head = ["residual", "where"]
@@ -149,11 +149,11 @@ def claims_table(standings: Sequence[Standing]) -> Table:
     return Table.plain(head, rows, words=2)
 
 
-def _change(paired: Paired | None) -> str:
+def _change(paired: PairedChange | None) -> str:
     """Return a paired change: value, interval, a sign for no difference, and the opponent."""
     if paired is None:
         return "-"
-    return f"{signed_interval(paired.change, paired.verdict)} ({paired.to})"
+    return f"{signed_interval(paired.change, paired.verdict)} ({paired.opponent})"
 
 
 _MAX_INTERVAL_KINDS = 3
@@ -220,8 +220,8 @@ def _record(standing: Standing) -> dict[str, str]:
 
 def _cells(value: Any, number: int) -> list[str]:
     """Return a field as cells of a CSV file; None gives empty cells."""
-    if isinstance(value, Paired):
-        return [value.to, *_cells(value.change, 3), value.verdict]
+    if isinstance(value, PairedChange):
+        return [value.opponent, *_cells(value.change, 3), value.verdict]
     if isinstance(value, Estimate):
         figures = (value.value, value.low, value.high)
         return ["" if figure is None else f"{figure:.6g}" for figure in figures]
@@ -281,8 +281,8 @@ def _parse_estimate(value: str, low: str, high: str) -> Estimate:
     return Estimate(float(value), float(low), float(high))
 
 
-def _parse_paired(to: str, value: str, low: str, high: str, verdict: str) -> Paired | None:
-    return Paired(to, _parse_estimate(value, low, high), verdict) if to else None
+def _parse_paired(to: str, value: str, low: str, high: str, verdict: str) -> PairedChange | None:
+    return PairedChange(to, _parse_estimate(value, low, high), verdict) if to else None
 
 
 _NEW_FIELDS = ("interval_over", "origin", "is_published")

@@ -10,17 +10,19 @@ from typing import Any, Literal
 
 import pandas as pd
 
-from train.evaluate import changes as terms
-from train.evaluate.changes import BEST_ANALYTIC, Change, Verdict
+from train.evaluate import terms
+from train.evaluate.changes import Change, Verdict
 from train.evaluate.environments import Column, Environment
 from train.evaluate.episodes import Evaluation, group_by
 from train.evaluate.maps import HeatMap, Scores, best_of, ranking
 from train.evaluate.progress import Curves, learning_curves
 from train.evaluate.residual_seeds import Origin
 from train.evaluate.robots import RobotScores
+from train.evaluate.scores import failures
 from train.evaluate.standings import Standing
 from train.evaluate.statistics import Estimate
-from train.evaluate.table import EpisodeTable, failures
+from train.evaluate.table import EpisodeTable
+from train.evaluate.terms import BEST_ANALYTIC
 from train.figures.colours import policy_colours
 from train.report.templates import load_template
 

@@ -13,8 +13,8 @@ from rich.console import Console
 from elastic_env.core.files import write_whole
 from train.evaluate.environments import Column
 from train.evaluate.episodes import Evaluation
+from train.evaluate.scores import median_of
 from train.evaluate.statistics import Estimate
-from train.evaluate.table import median_of
 from train.report.markdown import bullets, to_markdown
 from train.report.report_text import capital
 from train.report.tables import Head, Row, Table, column_notes, number_interval

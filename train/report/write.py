@@ -5,14 +5,16 @@ from pathlib import Path
 
 from elastic_env.core.errors import missing_extra
 from elastic_env.core.files import write_whole
-from train.evaluate.changes import SIGNS_ARE
 from train.evaluate.environments import Column
 from train.evaluate.episodes import Evaluation, group_by
+from train.evaluate.scores import score
 from train.evaluate.statistics import Estimate
-from train.evaluate.table import EpisodeTable, score
-from train.figures.chart import learning_chart, time_chart
-from train.figures.comparison_figures import cells_together, sweep_charts
+from train.evaluate.table import EpisodeTable
+from train.evaluate.terms import SIGNS_ARE
+from train.figures.comparison_figures import group_cells, sweep_charts
 from train.figures.map_plots import panels
+from train.figures.score_charts import learning_chart
+from train.figures.time_chart import time_chart
 from train.report.change_tables import changes_table
 from train.report.charts import forest, ladder
 from train.report.leaderboard import add_leaderboard
@@ -164,7 +166,7 @@ def _add_curves(page: Page, results: Results) -> None:
     traced = [e for e in results.evaluations if e.trace]
     share = _TOTAL_POINTS // (len(table.references) * len(table.scenarios))
     points = min(_MAX_POINTS, max(_MIN_POINTS, share))
-    for number, cells in enumerate(cells_together(traced)):
+    for number, cells in enumerate(group_cells(traced)):
         add_time_chart(page, cells, results.colours, points, is_folded=True, is_open=number == 0)
 
 

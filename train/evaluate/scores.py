@@ -1,0 +1,172 @@
+"""Scores of policies from rows of the episode table: means over robots and cells, and pairs."""
+
+from collections.abc import Callable, Sequence
+from typing import Any, Literal
+
+import numpy as np
+import pandas as pd
+
+from elastic_env.core.signals import Array
+from train.evaluate.environments import Column
+from train.evaluate.episodes import Evaluation, group_by
+from train.evaluate.statistics import (
+    Counts,
+    Estimate,
+    beats,
+    estimate,
+    mean_of_part,
+    mean_of_robots,
+    middle,
+)
+
+
+class EpisodesByRobot:
+    """Episodes by cell, training seed and robot, grouped once for all metrics.
+
+    Args:
+        rows: With `member`, `cell`, `robot` and metrics.
+    """
+
+    def __init__(self, rows: pd.DataFrame) -> None:
+        self._groups: Any = rows.groupby(["cell", "member", "robot"])
+        index = self._groups.size().index
+        cells, members = (index.get_level_values(i).to_numpy() for i in range(2))
+        robots = index.codes[2]
+        num_robots = len(index.levels[2])
+        self._seeds = {member: row for row, member in enumerate(rows["member"].unique())}
+        row_of = np.array([self._seeds[member] for member in members])
+        self._places: list[tuple[Any, Any, Any]] = []
+        for cell in rows["cell"].unique():
+            groups = np.flatnonzero(cells == cell)
+            # Intervals draw robots by column. A cell with all robots has them by name, another one
+            # in their order.
+            column_of, names = pd.factorize(robots[groups])
+            if len(names) == num_robots:
+                column_of = robots[groups]
+            self._places.append((groups, row_of[groups], column_of))
+
+    def figures(
+        self, metric: str, statistic: Literal["mean", "sum", "count"] = "mean"
+    ) -> list[Array]:
+        """A statistic over the episodes of each robot, (seeds, robots) for every cell.
+
+        Args:
+            metric: Its name.
+            statistic: nan without an episode; a mean also without a value.
+        """
+        values = self._groups[metric].agg(statistic).to_numpy(dtype=np.float64)
+        tables = []
+        for groups, rows, columns in self._places:
+            table = np.full((len(self._seeds), columns.max() + 1), np.nan)
+            table[rows, columns] = values[groups]
+            tables.append(table)
+        return tables
+
+
+def per_robot(rows: pd.DataFrame, metric: str) -> list[Array]:
+    """Means over the episodes of each robot, (seeds, robots) for every cell; nan without a value.
+
+    Args:
+        rows: With `member`, `cell`, `robot` and the metric.
+        metric: Its name.
+    """
+    return EpisodesByRobot(rows).figures(metric)
+
+
+def by_episode(rows: pd.DataFrame) -> pd.DataFrame:
+    """Return rows in which each random episode of an undrawn robot counts as a robot of its own.
+
+    Its seed is the name of the robot. Statistics of policies without training use these rows.
+    """
+    is_alone = rows["random"] & (rows["robot"] == "")
+    return rows.assign(robot=rows["robot"].where(~is_alone, rows["seed"].astype(str)))
+
+
+def score(
+    rows: pd.DataFrame,
+    column: Column,
+    mean: Callable[[Array, Array], Array] = mean_of_robots,
+) -> Estimate:
+    """Mean over cells of a metric of one policy [SI]; over training seeds the interquartile mean.
+
+    Args:
+        rows: Rows of one policy in one or several cells.
+        column: The metric.
+        mean: Mean over the robots of a cell that have a value, as `mean_of_robots`.
+    """
+    return over_cells(per_robot(rows, column.metric), mean)
+
+
+def over_cells(
+    values: Sequence[Array], mean: Callable[[Array, Array], Array] = mean_of_robots
+) -> Estimate:
+    """Mean over cells of means over robots, with its interval.
+
+    Args:
+        values: As `per_robot` returns them.
+        mean: See `score`.
+    """
+
+    def mean_of_cells(counts: Counts) -> Array:
+        return means_of_cells(values, counts, mean).mean(axis=0)
+
+    return estimate(mean_of_cells, [cell.shape[1] for cell in values])
+
+
+def median_of(evaluation: Evaluation, metric: str) -> Estimate:
+    """Median over the episodes that did not fail; for a residual interquartile mean over seeds.
+
+    The interval is over seeds and episodes. There is none if all episodes are the same.
+    """
+    condition = evaluation.condition
+    is_one = condition.environment.is_deterministic(condition.scenario, condition.reference)
+    seeds = group_by(evaluation.episodes, lambda episode: episode.get("training_seed"))
+    values = [
+        [None if e["termination"] else e.get(metric) for e in episodes[: 1 if is_one else None]]
+        for episodes in seeds.values()
+    ]
+    return over_cells([np.array(values, dtype=np.float64)], mean_of_part(middle))
+
+
+def means_of_cells(
+    values: Sequence[Array],
+    counts: Counts,
+    mean: Callable[[Array, Array], Array] = mean_of_robots,
+) -> Array:
+    """Means over the robots of every cell, (cells, resamples, seeds)."""
+    return np.array([mean(cell, count) for cell, count in zip(values, counts, strict=True)])
+
+
+def pair(mine: pd.DataFrame, base: pd.DataFrame, metric: str) -> pd.DataFrame:
+    """Return the episodes of a policy with those of its base that have the same cell and seed.
+
+    Args:
+        mine: Rows of a policy, with `member`, `cell`, `robot`, `seed` and the metric.
+        base: Rows of the base, one per cell and seed.
+        metric: Name of the metric.
+
+    Returns:
+        A row for each of the policy's, with `member`, `cell` and `robot`, the metric as `mine` and
+        `base`, and `won`: 1 where the policy is better (lower), one half in a tie. These three are
+        nan where either has no value.
+
+    Raises:
+        ValueError: A seed occurs twice, so that episodes cannot be paired.
+    """
+    for rows in (mine, base):
+        if rows.duplicated(["member", "cell", "seed"]).any():
+            raise ValueError(
+                f"every episode needs a seed of its own to be paired, got {rows['seed'].tolist()}"
+            )
+    theirs = base[["cell", "seed"]].assign(base=base[metric])
+    both = mine[["member", "cell", "robot", "seed"]].assign(mine=mine[metric])
+    both = both.merge(theirs, on=["cell", "seed"], how="left")
+    both = both.assign(won=beats(both["mine"], both["base"]))
+    values = both[["mine", "base", "won"]]
+    both[["mine", "base", "won"]] = values.where(values.notna().all(axis=1))
+    return both
+
+
+def failures(rows: pd.DataFrame) -> tuple[int, int]:
+    """Number of episodes that failed, and of all episodes."""
+    return int(rows["failed"].to_numpy().sum()), len(rows)
