@@ -57,7 +57,7 @@ class TestbedConfig(JointConfig):
             form=self.form,
             static_torque=pendulum.torque,
             torque_gradient=pendulum.torque_gradient,
-            motion=Motion(partial(reference.about, np.zeros(1)), reference.is_random),
+            motion=Motion(partial(reference.plan_about, np.zeros(1)), reference.is_random),
             imu_arm_m=testbed.imu_arm(pendulum),
         )
 
