@@ -154,8 +154,8 @@ def test_residuals_see_the_mirror_image_while_the_right_foot_is_that_of_the_step
     ("settings", "message"),
     [
         ({"observe": ("wrench.l_fx",)}, "no wrench.r_fx; observe both"),
-        ({"joints": ("l_knee",)}, "not for l_knee; name joints without"),
-        ({"acts_on": {"deflection": {"l_knee": 0.2, "r_knee": 0.6}}}, "not for l_knee"),
+        ({"joints": ("l_knee",)}, "differ for l_knee; name joints without"),
+        ({"acts_on": {"deflection": {"l_knee": 0.2, "r_knee": 0.6}}}, "differ for l_knee"),
     ],
 )
 def test_what_has_no_mirror_image_is_refused(settings: dict[str, Any], message: str) -> None:
