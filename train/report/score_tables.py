@@ -11,7 +11,7 @@ from train.evaluate.environments import Column
 from train.evaluate.episodes import group_by
 from train.evaluate.progress import Curves
 from train.evaluate.robots import RobotScores
-from train.evaluate.scores import by_episode, score
+from train.evaluate.scores import episodes_as_robots, score
 from train.evaluate.statistics import Estimate
 from train.evaluate.table import EpisodeTable
 from train.evaluate.terms import percent_interval
@@ -28,7 +28,7 @@ def scores_table(table: EpisodeTable, columns: Sequence[Column]) -> Table:
         for cell in table.cells_of(policy, reference, scenario):
             condition = table.conditions[policy, cell]
             own = table.rows_of(policy, cell)
-            own = by_episode(own) if condition.member is None else own
+            own = episodes_as_robots(own) if condition.member is None else own
             units = ([len(set(own["robot"]))], [condition.draws_robots])
             scores = [count_episodes_apart(score(own, column), *units) for column in columns]
             figures = map(number_interval, scores, columns)
