@@ -481,7 +481,7 @@ def test_a_policy_of_ones_own_stands_beside_published_ones_that_do_not_play(
     assert "published rows and your own must have the same version and protocol" in more
     text = published.read_text()
     published.write_text(text.replace("mujoco 4", "mujoco 3"))
-    assert "there by elastic-env" in refused([*mine[:-1], "other"])
+    assert "got published elastic-env" in refused([*mine[:-1], "other"])
     Path("board.yaml").write_text("name: board\n")
     assert "leaderboard: true" in refused([*mine[:-1], "none"])
     assert len(played) == 2  # all of it was found before anything played

@@ -73,7 +73,7 @@ def per_robot(rows: pd.DataFrame, metric: str) -> list[Array]:
     return EpisodesByRobot(rows).figures(metric)
 
 
-def by_episode(rows: pd.DataFrame) -> pd.DataFrame:
+def episodes_as_robots(rows: pd.DataFrame) -> pd.DataFrame:
     """Return rows in which each random episode of an undrawn robot counts as a robot of its own.
 
     Its seed is the name of the robot. Statistics of policies without training use these rows.

@@ -94,8 +94,8 @@ def append_standings(published: Sequence[Standing], own: Sequence[Standing]) -> 
     if theirs.keys() != ours.keys():
         there, here = (" and ".join(origins) or "nothing" for origins in (theirs, ours))
         raise ConfigurationError(
-            "published rows and your own must have the same version and protocol, got"
-            f" {there or 'an unknown version'} and {here}; the protocol is motions, scenarios,"
+            "published rows and your own must have the same version and protocol, got published"
+            f" {there or 'an unknown version'} and own {here}; the protocol is motions, scenarios,"
             " groups, episodes and seed"
         )
     policies = {row.policy for row in published}
