@@ -14,7 +14,7 @@ from train.commands.bench import BenchConfig, find_config
 from train.commands.cli import main
 from train.evaluate.conditions import Condition
 from train.evaluate.episodes import evaluate
-from train.runs.annotations import annotation
+from train.runs.github_annotations import annotation
 
 ROOT = Path(__file__).parents[1]
 QUICK = {"kind": "sine", "duration_s": 0.5, "onset_s": 0.5, "amplitude": 0.1}

@@ -24,7 +24,7 @@ from train.commands.compare_config import CompareConfig, Sweep
 from train.evaluate.changes import changes
 from train.evaluate.conditions import Condition, PolicySpec
 from train.evaluate.episodes import Evaluation, evaluate
-from train.evaluate.standings import PairedChange, Standing, standings
+from train.evaluate.leaderboard_rows import PairedChange, Standing, standings
 from train.evaluate.statistics import Estimate
 from train.report.leaderboard import (
     claims_table,

@@ -29,9 +29,9 @@ from tyro.constructors import (
 import elastic_env
 from elastic_env.core.config_problems import ModelError
 from elastic_env.core.errors import shorten
-from train.runs.annotations import annotation, runs_in_workflow
 from train.runs.console import PlainConsole, traceback_text, visible_warnings
 from train.runs.failures import DEFECT, SignalError, explain
+from train.runs.github_annotations import annotation, runs_in_workflow
 from train.runs.import_path import remove_from_path
 from train.runs.progress import announce_compilation
 

@@ -12,6 +12,7 @@ import numpy as np
 import pandas as pd
 
 from elastic_env.core.signals import Array
+from train.evaluate.change_text import FEWEST_SEEDS, percent
 from train.evaluate.environments import Column
 from train.evaluate.episodes import Evaluation, group_by
 from train.evaluate.scores import (
@@ -30,7 +31,6 @@ from train.evaluate.statistics import (
     interquartile_mean,
 )
 from train.evaluate.table import EpisodeTable, Groups, Scope
-from train.evaluate.terms import FEWEST_SEEDS, percent
 from train.evaluate.training_marks import training_marks
 
 Verdict = Literal["lower", "higher", "none", "unclear"]

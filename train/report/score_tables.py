@@ -6,6 +6,7 @@ from pathlib import Path
 
 from rich.console import Console
 
+from train.evaluate.change_text import percent_interval
 from train.evaluate.changes import count_episodes_apart
 from train.evaluate.environments import Column
 from train.evaluate.episodes import group_by
@@ -14,7 +15,6 @@ from train.evaluate.robots import RobotScores
 from train.evaluate.scores import episodes_as_robots, score
 from train.evaluate.statistics import Estimate
 from train.evaluate.table import EpisodeTable
-from train.evaluate.terms import percent_interval
 from train.figures.chart import quantiles
 from train.report.tables import Head, Row, Table, number_interval
 from train.report.terminal import print_table

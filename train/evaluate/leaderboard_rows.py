@@ -9,8 +9,7 @@ from elastic_env.core.errors import ConfigurationError
 from train.evaluate.changes import change_of
 from train.evaluate.environments import Column
 from train.evaluate.episodes import Evaluation, group_by
-from train.evaluate.maps import best_of
-from train.evaluate.scores import failures, score
+from train.evaluate.scores import best_of, failures, score
 from train.evaluate.statistics import Estimate
 from train.evaluate.table import EpisodeTable, Groups, Scope
 
