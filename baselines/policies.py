@@ -72,7 +72,7 @@ def make(name: str, env: Any, /, **options: Any) -> Policy:
     | `input_wrench` | – | the estimate uses the measured foot wrenches, not the planned share |
     | `dynamic` | full joint torque with D; servo with B inverted | the same, links as `input_wrench` |
     | `friction` | `dynamic`, and the model's Coulomb friction fed forward | – |
-    | `disturbance_observer` | `friction`, and the torque that the model lacks by the link's IMU | `foothold`, mean ZMP error by a DCM observer |
+    | `disturbance_observer` | `friction`, and the torque that the model lacks, by the link's IMU | `foothold`, mean ZMP error by a DCM observer |
     | `adaptive` | – | `input_output`, stiffness of each leg and weight estimated online |
     | `posture` | – | `input_output` with the pelvis' attitude fed back to the hips |
     | `adaptive_posture` | – | both |
@@ -143,7 +143,8 @@ def _residual_policy(folder: Path, env: Any, options: dict[str, Any]) -> Policy:
         has = f"the environment's has {', '.join(joints)}"
         raise ConfigurationError(f"{shorten(folder)} was trained on {trained}; {has}")
     base = make(description.base, env, **{**description.base_options, **options})
-    return ResidualPolicy(Corrected(base, model, description.settings, truth_of(env)), network)
+    corrected = Corrected(base, model, description.settings, truth_of(env))
+    return ResidualPolicy(corrected, network)
 
 
 def _learned_policy(folder: Path, env: Any, options: dict[str, Any]) -> Policy:

@@ -128,8 +128,8 @@ class JointSignals(LearnedSignals):
         self._encoder = table.group(LINK_ENCODER) if has_encoders else None
         if self._encoder is None and len(joints) > 1:
             raise ConfigurationError(
-                f"learning the offsets of {len(joints)} joints needs their links measured; make the"
-                f" environment with sensors=[{LINK_ENCODER!r}]"
+                f"learning the offsets of {len(joints)} joints needs their links"
+                f" measured; make the environment with sensors=[{LINK_ENCODER!r}]"
             )
 
     @override

@@ -95,7 +95,7 @@ def _sole_center(biped: Biped) -> Array:
     return np.array([0.0, 0.0, -biped.ankle_height])
 
 
-_KERNEL_GAINS = [name for name in WalkingGains.model_fields if not name.endswith("filter_s")]
+_KERNEL_GAINS = [f for f in WalkingGains.model_fields if not f.endswith("filter_s")]
 
 
 class WalkingController(BatchPolicy):
@@ -157,7 +157,8 @@ class WalkingController(BatchPolicy):
         """Act for a control step; an input `deflection` r winds the springs by 1 + r as much."""
         observations = self._walk_view.fields(rows)
         theta = rows[:, self._theta]
-        com, soles = self._biped.chains.com_and_feet(theta, self._sole, rows[:, self._attitude])
+        attitude = rows[:, self._attitude]
+        com, soles = self._biped.chains.com_and_feet(theta, self._sole, attitude)
         shares = _NO_SHARES
         if (shift := inputs.zmp_shift) is not None:
             shares = np.empty(len(rows))

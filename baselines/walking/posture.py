@@ -119,8 +119,8 @@ class PostureFeedback(PolicyAround):
         action, inner = self.policy.act(rows, memory.inner, inputs)
         total = action.astype(np.float64)
         after = np.empty(len(rows), FEEDBACK)
-        observations = self._walk_view.fields(rows)
-        add_feedback(self.gains, observations, self.ramp, change, memory.own, after, total)
+        fields = self._walk_view.fields(rows)
+        add_feedback(self.gains, fields, self.ramp, change, memory.own, after, total)
         return total.astype(np.float32), MemoryAround(after, inner)
 
 
@@ -193,8 +193,9 @@ def pitch_of_leg(gains: Any, right: Any, leg: int, turn: float, last: Any, memor
     share = right if leg == 1 else 1.0 - right
     standing = min(2.0 * share, 1.0)
     following = gains.swing_share if standing < 1.0 else 1.0
-    memory.leg_pitch[leg] = last.leg_pitch[leg] + following * (turn - last.leg_pitch[leg])
-    return last.leg_pitch[leg] + standing * (turn - last.leg_pitch[leg])
+    before = last.leg_pitch[leg]
+    memory.leg_pitch[leg] = before + following * (turn - before)
+    return before + standing * (turn - before)
 
 
 @compiled_part

@@ -122,7 +122,8 @@ class StandingEstimate(PolicyAround):
             force, error = self._feet.ground(rows, rows[:, self._wrench])
             measured = np.hstack([np.nan_to_num(error, nan=0.0), rows[:, self._attitude]])
             total = total + is_at_rest[:, None] * measured
-            load = load + is_at_rest * ((force[:, 0, 2] + force[:, 1, 2]) / self._weight - 1.0)
+            vertical = force[:, 0, 2] + force[:, 1, 2]
+            load = load + is_at_rest * (vertical / self._weight - 1.0)
         zmp = np.zeros((len(rows), 2)) if inputs.zmp is None else inputs.zmp.copy()
         gains = (self._per_total, self._constant, self._limit)
         add_prediction(gains, self._ramp, steps, total, zmp)

@@ -25,7 +25,7 @@ from train.export.c_text import (
     enum_lines,
     fill_template,
     identifier,
-    member_values,
+    member_text,
     number,
     number_list,
     numbers,
@@ -153,8 +153,8 @@ def _tables(constants: CompensatorConstants, frames: Sequence[Frame]) -> dict[st
 
 
 def _link_text(row: Any) -> str:
-    masses = member_values(row, "mass mass_moment inertia weight weight_moment")
-    place = f"{row['parent']}, {row['column']}, {member_values(row, 'zero R anchor')}"
+    masses = member_text(row, "mass mass_moment inertia weight weight_moment")
+    place = f"{row['parent']}, {row['column']}, {member_text(row, 'zero R anchor')}"
     return f"    {{{place},\n     {{{masses}}}}}"
 
 

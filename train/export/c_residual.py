@@ -57,7 +57,7 @@ def c_residual(layout: ResidualLayout, prefix: str) -> str:
         decision_period=settings.decision_period,
         has_mirror=int(layout.mirrors is not None),
         column_names=enum_lines(
-            unique_names(f"{prefix.upper()}_", [signal.name for signal in layout.columns])
+            unique_names(f"{prefix.upper()}_", [s.name for s in layout.columns])
         ),
         mean=numbers(layout.tensors["mean"].astype(np.float64)),
         std=numbers(layout.tensors["std"].astype(np.float64)),

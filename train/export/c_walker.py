@@ -14,7 +14,7 @@ import numpy as np
 from baselines.adaptation.estimators import ASSUMED_LOADS
 from baselines.compensation.compensated import Compensated
 from baselines.compensation.contact_torque import ContactGravity
-from baselines.estimation.bending import DISAGREEMENT_RAD, LOADED_SHARE, MODEL_ERROR, OFFSET_RAD
+from baselines.estimation import bending
 from elastic_env.core.signals import Array
 from elastic_env.world.robot_model import WalkerModel
 from train.export.c_text import (
@@ -22,7 +22,7 @@ from train.export.c_text import (
     comment,
     fill_template,
     initialiser,
-    member_values,
+    member_text,
     number,
     number_list,
     numbers,
@@ -35,8 +35,8 @@ from train.export.walker_vectors import play_steps
 _TEST_STEPS = 12
 _CONTROLLER_CONSTANTS = (
     "thigh shank weight weight_of_feet omega velocity_share zmp_share weight_share"
-    " force_difference force_difference_decay_s force_difference_limit_m dcm zmp_limit_m"
-    " friction_rate_rad_s"
+    " force_difference force_difference_decay_s force_difference_limit_m dcm"
+    " zmp_limit_m friction_rate_rad_s"
 )
 _GAINS = "proportional integral derivative leak_s trim integral_limit filter_share swing_share"
 
@@ -121,10 +121,10 @@ def _adaptive_tables(layers: WalkerLayers) -> dict[str, str]:
         "turn_limit": gains["limit_rad"],
         "correction_limit": adaptive.limit,
         "correction_share": adaptive.share,
-        "error_variance": MODEL_ERROR**2,
-        "offset_variance": OFFSET_RAD**2,
-        "measured_variance": DISAGREEMENT_RAD**2,
-        "loaded_n": LOADED_SHARE * carried,
+        "error_variance": bending.MODEL_ERROR**2,
+        "offset_variance": bending.OFFSET_RAD**2,
+        "measured_variance": bending.DISAGREEMENT_RAD**2,
+        "loaded_n": bending.LOADED_SHARE * carried,
         "carried_n": carried,
         "assumed_loads": ASSUMED_LOADS,
     }
@@ -153,7 +153,7 @@ def _masses_below_sensors(model: WalkerModel) -> tuple[Array, Array]:
 
 def _link_text(row: Any) -> str:
     place = f"{row['parent']}, {row['column']}, {row['tip']}"
-    return f"    {{{place}, {member_values(row, 'zero R anchor weight weight_moment')}}}"
+    return f"    {{{place}, {member_text(row, 'zero R anchor weight weight_moment')}}}"
 
 
 def _test_vector(policy: Any, prefix: str) -> str:

@@ -116,12 +116,11 @@ class ResidualLayout:
             on_right: True if the step is on the right foot, (N, 1); without a mirror it has no
                 effect.
         """
-        if self.mirrors is None:
-            residual = self.network(features)
-        else:
-            mirror_features, mirror_residual = self.mirrors
-            residual = self.network(np.where(on_right, mirror_features(features), features))
-            residual = np.where(on_right, mirror_residual(residual), residual)
+        if self.mirrors is not None:
+            features = np.where(on_right, self.mirrors[0](features), features)
+        residual = self.network(features)
+        if self.mirrors is not None:
+            residual = np.where(on_right, self.mirrors[1](residual), residual)
         return residual, self.bounds * residual[:, self.source]
 
     def draw(self, count: int, seed: int = 0) -> dict[str, Any]:

@@ -46,7 +46,8 @@ def play_steps(policy: Any, count: int, seed: int = 0) -> PlayedSteps:
     """
     model = find_layers(policy).model
     row = np.linspace(1.0, model.plan.num_steps, count).astype(np.int64)
-    return play_observations(policy, _random_observations(model, row, np.random.default_rng(seed)))
+    rows = _random_observations(model, row, np.random.default_rng(seed))
+    return play_observations(policy, rows)
 
 
 def play_observations(policy: Any, rows: Array) -> PlayedSteps:

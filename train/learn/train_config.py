@@ -119,8 +119,8 @@ class TrainConfig(CodeNamingModel):
     def _check_critic(self) -> Self:
         if self.critic_sees and self.algorithm in ("SAC", CONSTANTS):
             raise ValueError(
-                f"critic_sees is for PPO and A2C, whose critic has inputs of its own, got"
-                f" {self.algorithm}; leave it out"
+                "critic_sees is for PPO and A2C, whose critic has inputs of its own,"
+                f" got {self.algorithm}; leave it out"
             )
         return self
 
