@@ -10,8 +10,6 @@ from baselines.catalogue import (
     ASSUMED_OPTIONS,
     BEST_ON_JOINTS,
     BEST_ON_THE_WALKER,
-    ON_JOINTS,
-    ON_THE_WALKER,
     Track,
     policies_of,
 )
@@ -36,7 +34,7 @@ def is_saved(name: str) -> bool:
 
 def policy_names() -> list[str]:
     """Names that `make` accepts."""
-    return list({**ON_THE_WALKER, **ON_JOINTS})
+    return list({**policies_of(is_walker=True), **policies_of(is_walker=False)})
 
 
 def track(name: str, is_walker: bool = True) -> Track:
@@ -160,8 +158,7 @@ def _learned_policy(folder: Path, env: Any, options: dict[str, Any]) -> Policy:
 
 def _require_effect(name: str, env: Any, given: Any, usable: tuple[str, ...]) -> None:
     """Refuse options without effect on a policy."""
-    listed = ", ".join(usable)
-    takes = f"its options are: {listed}" if usable else "it has no options"
+    takes = f"its options are: {', '.join(usable)}" if usable else "it has no options"
     for option in given:
         if option not in usable:
             # of the policies with options only the oracle assumes no stiffness

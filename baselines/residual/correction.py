@@ -193,8 +193,7 @@ def _column_bounds(name: str, settings: ResidualSettings, joints: list[str]) -> 
     chosen = np.ones(len(names), dtype=np.bool_)
     wanted_joints = settings.joints if kind.axes is None else None
     if wanted_joints is not None:
-        fits = [fit_columns(wanted, names, kind) for wanted in wanted_joints]
-        chosen = np.any(fits, axis=0)
+        chosen = np.any([fit_columns(j, names, kind) for j in wanted_joints], axis=0)
     if not isinstance(bound, dict):
         return np.where(chosen, bound, 0.0)
     bounds = np.zeros(len(names))

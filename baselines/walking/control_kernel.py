@@ -150,8 +150,7 @@ def follow_com(
             memory.velocity[i] = last.velocity[i] + constants.velocity_share * velocity_step
             error = deviation + memory.velocity[i] / constants.omega
             gain = (1.0 + change) * constants.dcm
-            wanted = within(gain * error, constants.zmp_limit_m)
-            missing = wanted - last.shift[i]
+            missing = within(gain * error, constants.zmp_limit_m) - last.shift[i]
             memory.shift[i] = last.shift[i] + constants.zmp_share * missing
 
 
@@ -175,8 +174,7 @@ def offset_leg(
     difference = memory.difference + added.leg_length
     knee_angle = obs.reference_angle[first + 3]
     hip, knee, ankle = lengthening(constants, knee_angle, difference, sign)
-    share = obs.load_share if leg == 1 else 1.0 - obs.load_share
-    load = share * constants.weight
+    load = (obs.load_share if leg == 1 else 1.0 - obs.load_share) * constants.weight
     cosine = planned.foot_yaw[leg, 0]
     sine = planned.foot_yaw[leg, 1]
     forward = cosine * memory.shift[0] + sine * memory.shift[1]  # in the foot's frame

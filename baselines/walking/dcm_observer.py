@@ -163,8 +163,7 @@ def observe(
         obs = observations[world]
         right = obs.load_share
         periods = np.rint(obs.clock[0] / known.period_s)
-        row = int(min(max(periods - 1.0, 0.0), len(plan) - 1.0))
-        planned = plan[row]
+        planned = plan[int(min(max(periods - 1.0, 0.0), len(plan) - 1.0))]
         for i in range(2):
             on_left = com[world, i] - soles[world, 0, i] + planned.soles[0, i]
             on_right = com[world, i] - soles[world, 1, i] + planned.soles[1, i]

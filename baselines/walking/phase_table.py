@@ -109,8 +109,8 @@ def load_phase_table(step_period_s: float, file: Path | None = None) -> PhaseTab
         has = f"those for step periods of {periods} s" if periods else "none"
         raise ConfigurationError(
             "phase_table needs a table for the step period of the gait,"
-            f" {step_period_s:g} s; the package has {has}; find one by `python -m"
-            " train.learn.phase_table` and name its file in the option phase_table"
+            f" {step_period_s:g} s; the package has {has}; find one by"
+            " `python -m train.learn.phase_table` and name its file in the option phase_table"
         )
 
     def missing(why: str) -> str:

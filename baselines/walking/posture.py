@@ -190,8 +190,7 @@ def pitch_of_leg(gains: Any, right: Any, leg: int, turn: float, last: Any, memor
 
     A leg that carries half of the weight turns at once, a leg in the air follows slowly.
     """
-    share = right if leg == 1 else 1.0 - right
-    standing = min(2.0 * share, 1.0)
+    standing = min(2.0 * (right if leg == 1 else 1.0 - right), 1.0)
     following = gains.swing_share if standing < 1.0 else 1.0
     before = last.leg_pitch[leg]
     memory.leg_pitch[leg] = before + following * (turn - before)

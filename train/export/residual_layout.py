@@ -126,8 +126,7 @@ class ResidualLayout:
     def draw(self, count: int, seed: int = 0) -> dict[str, Any]:
         """Draw random arguments of `decide`; some features are beyond the bound of the network."""
         generator = np.random.default_rng(seed)
-        shape = (count, len(self.features))
-        normalised = generator.standard_t(_HEAVY_TAIL, shape)
+        normalised = generator.standard_t(_HEAVY_TAIL, (count, len(self.features)))
         features = self.tensors["mean"] + self.tensors["std"] * normalised
         on_right = generator.random((count, 1)) < 0.5
         if self.mirrors is not None:  # `decide` mirrors them back

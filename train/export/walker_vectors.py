@@ -110,8 +110,7 @@ def _sensor_fields(layers: WalkerLayers, rows: Array) -> list[Array]:
     reference = [rows[:, table.group(name)] for name in ("reference_angle", "reference_rate")]
     share = rows[:, table.group("load_share")][:, 0]
     support: Any = rows[:, table.columns("clock.support")][:, 0].astype(np.int64)
-    zmp = rows[:, table.group("zmp_reference")]
-    return [*sensors, *reference, share, zmp, support]
+    return [*sensors, *reference, share, rows[:, table.group("zmp_reference")], support]
 
 
 def _plan_fields(model: WalkerModel, row: IntArray) -> list[Array]:

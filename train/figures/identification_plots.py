@@ -131,8 +131,7 @@ def deflections(fit: ArmFit) -> tuple[Array, Array]:
     size = np.sum(lever**2, axis=1)
     largest = size.max(axis=0)
     of_all = _SMALLEST_JOINT_LEVER**2 * largest.max()
-    smallest = np.maximum(_SMALLEST_LEVER**2 * largest, of_all)
-    is_measured = size > smallest
+    is_measured = size > np.maximum(_SMALLEST_LEVER**2 * largest, of_all)
     projection = np.sum(lever * fit.residual[..., None], axis=1)
     measured = predicted + projection / np.where(is_measured, size, 1.0)
     return predicted, np.where(is_measured, measured, np.nan)

@@ -237,8 +237,7 @@ def best_play(plays: Sequence[Play]) -> Play:
 def main(search: Search) -> None:
     """Find a table, and write it."""
     table = find_table(search)
-    name = f"{round(1000.0 * search.step_period)}ms.json"
-    file = search.output or FOLDER / name
+    file = search.output or FOLDER / f"{round(1000.0 * search.step_period)}ms.json"
     file.parent.mkdir(parents=True, exist_ok=True)
     write_whole(file, table.model_dump_json(indent=2) + "\n")
     Console().print(f"wrote {file}")

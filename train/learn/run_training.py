@@ -120,8 +120,7 @@ def _train(runs: Sequence[Run], console: Console, executors: Executors) -> None:
     names = [f"seed {seed}" for _, seed in calls]
     if len(runs) > 1:
         names = [f"{run.folder}, seed {seed}" for run, seed in calls]
-    decisions = [run.config.decisions for run, _ in calls]
-    totals = dict(zip(names, decisions, strict=True))
+    totals = dict(zip(names, (r.config.decisions for r, _ in calls), strict=True))
     with show_progress(console, totals, unit="decisions") as show:
         if executors == ONE_BY_ONE:
             for number, (run, seed) in enumerate(calls):

@@ -209,8 +209,7 @@ def training_worlds(
         for scenario, _ in shares
     ]
     weights = [config.weights.get(scenario, 1.0) for scenario, _ in shares]
-    sizes = [count for _, count in shares]
-    worlds = mixed_env(conditions, sizes, threads, weights)
+    worlds = mixed_env(conditions, [count for _, count in shares], threads, weights)
     base = baselines.make(config.base, worlds, **config.base_options)
     settings = config.settings.model_dump()
     mode = AutoresetMode.SAME_STEP
