@@ -174,7 +174,8 @@ def offset_leg(
     difference = memory.difference + added.leg_length
     knee_angle = obs.reference_angle[first + 3]
     hip, knee, ankle = lengthening(constants, knee_angle, difference, sign)
-    load = (obs.load_share if leg == 1 else 1.0 - obs.load_share) * constants.weight
+    share = obs.load_share if leg == 1 else 1.0 - obs.load_share
+    load = share * constants.weight
     cosine = planned.foot_yaw[leg, 0]
     sine = planned.foot_yaw[leg, 1]
     forward = cosine * memory.shift[0] + sine * memory.shift[1]  # in the foot's frame
