@@ -27,7 +27,7 @@ from baselines.compensation.measured import (
 )
 from baselines.compensation.oracle import Oracle, TrueSensors
 from baselines.compensation.policy import Policy, Zero
-from baselines.policy_options import PolicyOptions
+from baselines.policy_options import ASSUMED_OPTIONS, PolicyOptions
 from baselines.walking.controller import WalkingController, WalkingGains
 from baselines.walking.dcm_observer import DcmObserver
 from baselines.walking.foot_tare import FootTare
@@ -307,8 +307,6 @@ COMPENSATED: Mapping[str, Builder] = {
     "dynamic": _compensate(_controller, DynamicCompensator, "wrench"),
 }
 """Compensated policies of a walker, on which a feedback can build."""
-ASSUMED_OPTIONS = ("stiffness", "stiffness_scale")
-"""Options for the assumed stiffness of the joints."""
 _COMPENSATOR_OPTIONS = (*ASSUMED_OPTIONS, "output", "gravity", "ramp_s")
 _CONTROLLER_OPTIONS = ("gains", "com_feedback", "ramp_s")
 _COMPENSATED_OPTIONS = (*_COMPENSATOR_OPTIONS, "gains", "com_feedback")

@@ -6,15 +6,9 @@ from typing import Any
 from baselines.adaptation.iterative import LearnedOffsets
 from baselines.adaptation.learned_signals import learned_signals
 from baselines.adaptation.offset_folder import load_table
-from baselines.catalogue import (
-    ASSUMED_OPTIONS,
-    BEST_ON_JOINTS,
-    BEST_ON_THE_WALKER,
-    Track,
-    policies_of,
-)
+from baselines.catalogue import BEST_ON_JOINTS, BEST_ON_THE_WALKER, Track, policies_of
 from baselines.compensation.policy import Policy
-from baselines.policy_options import PolicyOptions
+from baselines.policy_options import ASSUMED_OPTIONS, PolicyOptions
 from baselines.residual.correction import Corrected
 from baselines.residual.residual_folder import load_residual
 from baselines.residual.residual_policy import ResidualPolicy

@@ -44,8 +44,9 @@ from typing_extensions import override
 
 from baselines.compensation.compensators import GravityCompensator
 from baselines.compensation.dry_friction import presliding_friction
+from baselines.compensation.filters import filter_share
 from baselines.compensation.measured import require_sensor
-from baselines.compensation.policy import PolicyAround, PolicyInputs, Step, filter_share
+from baselines.compensation.policy import PolicyAround, PolicyInputs, Step
 from baselines.compensation.startup import Ramp
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array, IntArray
@@ -193,23 +194,24 @@ class DisturbanceObserver(PolicyAround):
 
         def smooth(value: Array, before: Array) -> Array:
             """Value behind the common filter."""
-            return np.where(is_zeroing, value, before + self._smooth_share * (value - before))
+            filtered = before + self._smooth_share * (value - before)
+            return np.where(is_zeroing, value, filtered)
 
         delta = smooth(deflection, last.smooth_deflection)
         delta_dot = (deflection - delta) / gains.rate_filter_s
         q = smooth(theta - deflection, last.smooth_q)
         q_dot = (theta - deflection - q) / gains.rate_filter_s
-        smooth_friction = smooth(friction, last.smooth_friction)
+        known_friction = smooth(friction, last.smooth_friction)
         passed = joint_torque(delta, delta_dot, model.stiffness, model.damping, model.backlash)
         q_ddot = (q_dot - last.rate) / dt
         needed = self._static.gravity.inverse_dynamics(q, q_dot, q_ddot)
         # at rest dry friction takes any value up to F: only torque beyond is a disturbance
         excess = passed - needed - last.disturbance
         static = np.clip(excess, -self._coulomb, self._coulomb)
-        friction_torque = np.where(q_ref_dot == 0.0, static, smooth_friction)
+        friction_torque = np.where(q_ref_dot == 0.0, static, known_friction)
         missing = np.where(is_zeroing, 0.0, passed - needed - friction_torque)
         estimate = last.disturbance + self._follow_share * (missing - last.disturbance)
         estimate = np.clip(estimate, -gains.limit_nm, gains.limit_nm)
         return JointObservation(
-            offset, imu, deflection, friction, delta, q, smooth_friction, q_dot, estimate
+            offset, imu, deflection, friction, delta, q, known_friction, q_dot, estimate
         )

@@ -140,11 +140,11 @@ class IterativeLearner(LearnedOffsets):
         # the first error of a world has no limit
         last = np.where(np.isfinite(before), before, np.nan_to_num(trial.error))
         errors = limit_surprise(trial.error, last, surprise)
-        next_tables = np.empty_like(tables)
+        updated = np.empty_like(tables)
         for world, (table, error) in enumerate(zip(tables, errors, strict=True)):
-            next_tables[world] = update(table, error, gains, self._period_s, trial.number)
+            updated[world] = update(table, error, gains, self._period_s, trial.number)
         failed = trial.failed[:, None, None]
-        tables = np.where(failed, _SHARE_AFTER_FAILURE * tables, next_tables)
+        tables = np.where(failed, _SHARE_AFTER_FAILURE * tables, updated)
         return tables, np.where(failed, before, errors)
 
 

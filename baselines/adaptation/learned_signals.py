@@ -134,9 +134,9 @@ class JointSignals(LearnedSignals):
 
     @override
     def error(self, before: Array, after: Array, info: Mapping[str, Any]) -> Array:
-        by_imu = self._encoder is None
-        link = np.reshape(info[_LINK_ANGLE], (-1, 1)) if by_imu else after[:, self._encoder]
-        return before[:, self._reference] - link
+        if self._encoder is None:
+            return before[:, self._reference] - np.reshape(info[_LINK_ANGLE], (-1, 1))
+        return before[:, self._reference] - after[:, self._encoder]
 
     @override
     def offsets(self, table: Array) -> Array:

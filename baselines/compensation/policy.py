@@ -290,8 +290,3 @@ def as_batch_policy(policy: Any, model: RobotModel) -> BatchPolicy:
 def as_action(offsets: Array, is_single: bool) -> Action:
     """Offsets in single precision: all rows, or the only row for an observation of one world."""
     return (offsets[0] if is_single else offsets).astype(np.float32, copy=False)
-
-
-def filter_share(period_s: float, time_constant_s: float) -> float:
-    """Share of its remaining way that a first-order filter goes in a period [1]."""
-    return 1.0 - float(np.exp(-period_s / time_constant_s))

@@ -28,7 +28,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from baselines.compensation.policy import filter_share
+from baselines.compensation.filters import filter_share
 from baselines.estimation.bending import LOADED_SHARE, BendingObserver
 from elastic_env.core.signals import Array, rename_group
 from elastic_env.rigid.leg_kinematics import rotation_of_tilt

@@ -30,8 +30,9 @@ import numpy as np
 from typing_extensions import override
 
 from baselines.compensation.contact_torque import cosine_and_sine, planned_feet, shifted_shares
+from baselines.compensation.filters import filter_share
 from baselines.compensation.observation_view import WalkView
-from baselines.compensation.policy import BatchPolicy, PolicyInputs, Step, filter_share
+from baselines.compensation.policy import BatchPolicy, PolicyInputs, Step
 from baselines.compensation.records import Records, record_row, record_rows
 from baselines.compensation.startup import feedback_ramp
 from baselines.walking.control_kernel import INPUTS, MEMORY, control

@@ -89,12 +89,10 @@ def payload_frames(constants: CompensatorConstants) -> list[Frame]:
     tree = constants.body.tree
     bodies = [b for b in range(model.nbody) if tree.carrier[b] > 0]
     body_names = {model.body(b).name: b for b in bodies if model.body(b).name}
+    origin = (np.zeros(3), np.eye(3))
     candidates: list[tuple[str, int, Array, Array]] = [
-        ("TIP", constants.tip, np.zeros(3), np.eye(3)),
-        *(
-            (f"BODY_{c_text.identifier(n)}", b, np.zeros(3), np.eye(3))
-            for n, b in body_names.items()
-        ),
+        ("TIP", constants.tip, *origin),
+        *((f"BODY_{c_text.identifier(n)}", b, *origin) for n, b in body_names.items()),
     ]
     for i in range(model.nsite):
         site = model.site(i)

@@ -48,10 +48,10 @@ class Curve:
     crosses: Sequence[bool] = ()
 
     @classmethod
-    def median(cls, name: str, colour: str, x: Array, values: Array, **look: Any) -> Self:
+    def median(cls, name: str, colour: str, x: Array, y: Array, **look: Any) -> Self:
         """Median of several series, (series, n), with a band from the least to the greatest."""
-        low, middle, high = quantiles(values)
-        band = (low, high) if len(values) > 1 else None
+        low, middle, high = quantiles(y)
+        band = (low, high) if len(y) > 1 else None
         return cls(name, colour, x, middle, band=band, **look)
 
 

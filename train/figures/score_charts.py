@@ -83,7 +83,7 @@ def _failure_panels(cells: Cells, values: Sequence[float], colours: Colours) -> 
             crosses = list(all_failed.values())
             curves.append(Curve("", colours[title], x, y, crosses=crosses))
             rows.append(title)
-    first = next(e for points in cells.values() for e in chain(*points.values())).condition
+    first = next(e for row in cells.values() for e in chain(*row.values())).condition
     limits = (len(rows) - 0.4, -0.6)
     height = 0.2 * len(rows) + 0.2
     panel = Panel(first.environment.failure, curves, limits, height=height, rows=rows)

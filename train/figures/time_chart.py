@@ -41,7 +41,7 @@ def time_chart(
     parts = _split_policies(policies, signals, most)
     panels = []
     for signal, titles in product(signals, parts):
-        curves = [_trace_curve(t, colours[t], policies[t], signal, stride) for t in titles]
+        curves = [_curve(t, colours[t], policies[t], signal, stride) for t in titles]
         if signal.reference is not None:
             y = signal.scale * longest[signal.reference][::stride]
             look = (REFERENCE, time_s[::stride], y, "dash")
@@ -64,7 +64,7 @@ def _split_policies(
     number = -(-len(policies) // most)
     if number == 1:
         return [list(policies)]
-    errors = np.array([[_rms(seeds, s) for s in signals] for seeds in policies.values()])
+    errors = np.array([[_rms(runs, s) for s in signals] for runs in policies.values()])
     sizes = np.nansum(errors / np.maximum(np.nanmax(errors, axis=0), 1e-12), axis=1)
     titles = list(policies)
     order = [titles[index] for index in np.argsort(-sizes, kind="stable")]
@@ -95,9 +95,7 @@ def _longest_trace(evaluations: Evaluations) -> Mapping[str, Array]:
     return max((e.trace for e in evaluations), key=lambda trace: len(trace["time_s"]))
 
 
-def _trace_curve(
-    title: str, colour: str, seeds: Evaluations, signal: TracedSignal, stride: int
-) -> Curve:
+def _curve(title: str, colour: str, seeds: Evaluations, signal: TracedSignal, stride: int) -> Curve:
     """Curve of a signal under a policy, from an evaluation per training seed."""
     time_s = _longest_trace(seeds)["time_s"]
     values = np.full((len(seeds), len(time_s)), np.nan)
