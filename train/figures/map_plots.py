@@ -106,8 +106,8 @@ def panels(heat_map: HeatMap) -> list[Panel]:
     result = [panel(f"Best policy, and its {column.label}", best, key=key)]
     for title in heat_map.table.members:
         change = partial(_change_square, title=title, letters=rival_letters)
-        panel_title = f"{title} against the {BEST_ANALYTIC}, change of {column.title} [%]"
-        result.append(panel(panel_title, change))
+        text = f"{title} against the {BEST_ANALYTIC}, change of {column.title} [%]"
+        result.append(panel(text, change))
     for title in policies:
         score = partial(_score_square, title=title, column=column, ends=ends)
         result.append(panel(f"{title}, {column.label}", score, is_main=False))
