@@ -74,7 +74,8 @@ def _strict_schema(schema: Any) -> Any:
         strict["strict"] = True
     if kind not in ("float", "int", "list", "tuple"):
         return strict
-    return no_info_before_validator_function(_to_whole if kind == "int" else plain_numbers, strict)
+    convert = _to_whole if kind == "int" else plain_numbers
+    return no_info_before_validator_function(convert, strict)
 
 
 def _to_whole(value: Any) -> Any:
@@ -101,7 +102,8 @@ class Model(BaseModel):
         try:
             super().__init__(**values)
         except ValidationError as error:
-            raise ModelError(type(self).__name__, problems_of(type(self), error, values)) from None
+            problems = problems_of(type(self), error, values)
+            raise ModelError(type(self).__name__, problems) from None
 
     def _check(self) -> None:
         """Refuse parameters that contradict each other, by a ValueError."""
@@ -118,7 +120,8 @@ class Model(BaseModel):
         for field in cls.model_fields.values():
             if field.description is not None:
                 parts = re.split(r"\n\s*\n", field.description)
-                field.description = "\n\n".join([" ".join(part.split()) for part in parts])
+                lines = [" ".join(part.split()) for part in parts]
+                field.description = "\n\n".join(lines)
 
     @classmethod
     def __get_pydantic_core_schema__(cls, source: Any, handler: Any) -> CoreSchema:
@@ -162,7 +165,7 @@ Entries = Annotated[list[_Entry], Field(min_length=1, max_length=MOST_ENTRIES)]
 """A list of a configuration that must not be empty."""
 LARGEST_SEED = 2**63 - 1
 """Seeds of episodes are 64-bit integers."""
-_BYTES_PER_CHARACTER = 4
+_UTF8_BYTES = 4
 """Most bytes of a character in UTF-8."""
 
 
@@ -232,9 +235,10 @@ def load_json(
         ConfigurationError: The file cannot be read, is not a JSON mapping, or does not fit the
             model.
     """
-    content = read_json(path, _BYTES_PER_CHARACTER * LARGEST_JSON, missing, within)
+    content = read_json(path, _UTF8_BYTES * LARGEST_JSON, missing, within)
     if not isinstance(content, dict):
-        raise ConfigurationError(f"{shorten(path)} must be a mapping, got {type(content).__name__}")
+        kind = type(content).__name__
+        raise ConfigurationError(f"{shorten(path)} must be a mapping, got {kind}")
     try:
         return model(**content)
     except ModelError as error:
@@ -253,9 +257,7 @@ def read_mapping(file: Path, empty: bool = False) -> dict[str, Any]:
         ConfigurationError: The file cannot be read, is no YAML, or holds something else.
     """
     try:
-        content = parse_yaml(
-            read_bounded(file, _BYTES_PER_CHARACTER * LARGEST_TEXT).decode("utf-8")
-        )
+        content = parse_yaml(read_bounded(file, _UTF8_BYTES * LARGEST_TEXT).decode())
     except ConfigurationError:
         raise
     except (yaml.YAMLError, UnicodeDecodeError) as error:

@@ -29,6 +29,11 @@ def friction_name(joint: str) -> str:
     return f"{joint}_dry_friction"
 
 
+def part_names(joint: str) -> tuple[str, ...]:
+    """Names of all these parts."""
+    return motor_name(joint), spring_name(joint), servo_name(joint), friction_name(joint)
+
+
 @dataclass(frozen=True)
 class JointAddresses:
     """Indices of motor and link angles of the elastic joints in `qpos` and `qvel`, each (n,)."""

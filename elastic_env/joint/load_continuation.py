@@ -176,8 +176,8 @@ class _Springs:
 
     def softest(self, q: Array, load: Array) -> IntArray:
         """Return the joint that moves most in the direction of least stiffness, (...)."""
-        matrix = self._matrix(q, load * self.compliance, np.ones_like(load, dtype=np.bool_))
-        values, vectors = np.linalg.eig(matrix)
+        every = np.ones_like(load, dtype=np.bool_)
+        values, vectors = np.linalg.eig(self._matrix(q, load * self.compliance, every))
         least = np.real(values).argmin(axis=-1)[..., None, None]
         softest = np.take_along_axis(vectors, least, axis=-1)[..., 0]
         return np.abs(softest).argmax(axis=-1)

@@ -116,7 +116,8 @@ def require_known_torque(model: MjModel, joints: Sequence[str]) -> None:
         if affected & ids:
             raise ConfigurationError(
                 f"the model has an equality constraint of {ends}, whose torque is not known in"
-                f" advance; take it out of the model{_hold_cure(model, affected & ids, ids)}"
+                " advance; take it out of the model"
+                f"{_hold_cure(model, affected & ids, ids)}"
             )
     for t in range(model.ntendon):
         affected = affected_joints.tendon_joints(model, t) & ids
@@ -128,12 +129,13 @@ def require_known_torque(model: MjModel, joints: Sequence[str]) -> None:
             )
     for a in range(model.nactuator):
         if affected := affected_joints.remote_actuator_joints(model, a) & ids:
-            names = model_joints.first_names([model.joint(j).name for j in sorted(affected)])
-            transmission = affected_joints.TRANSMISSIONS[int(model.actuator_trntype[a])]
+            names = [model.joint(j).name for j in sorted(affected)]
+            means = affected_joints.TRANSMISSIONS[int(model.actuator_trntype[a])]
             raise ConfigurationError(
-                f"the model's actuator {model.actuator(a).name!r} drives {names} by"
-                f" {transmission}, which is not compensated; drive each joint by an actuator of its"
-                f" own, or take this one out of the model{_hold_cure(model, affected, ids)}"
+                f"the model's actuator {model.actuator(a).name!r} drives"
+                f" {model_joints.first_names(names)} by {means}, which is not compensated;"
+                " drive each joint by an actuator of its own, or take this one out of the"
+                f" model{_hold_cure(model, affected, ids)}"
             )
     for j in np.flatnonzero(model.jnt_stiffnesspoly.any(axis=-1)):
         if int(j) in ids:

@@ -122,7 +122,8 @@ def _without_constraints(model: mujoco.MjModel) -> mujoco.MjModel:
     linear.opt.disableflags |= int(np.bitwise_or.reduce(_LEFT_OUT))
     linear.dof_frictionloss[:] = 0.0
     linear.tendon_frictionloss[:] = 0.0
-    linear.tendon_lengthspring[:] = linear.tendon_lengthspring.mean(axis=1, keepdims=True)
+    middle = linear.tendon_lengthspring.mean(axis=1, keepdims=True)
+    linear.tendon_lengthspring[:] = middle
     return linear
 
 

@@ -71,7 +71,8 @@ class Gait(Model):
     @property
     def step_period_s(self) -> float:
         """Duration of a step [s]."""
-        return self.double_support_s + self.single_support_s + self.last_double_support_s
+        swing_s = self.double_support_s + self.single_support_s
+        return swing_s + self.last_double_support_s
 
     @property
     def duration_s(self) -> float:
@@ -264,7 +265,8 @@ def zmp_reference(gait: Gait, timing: Timing, feet: Footholds) -> Array:
     zmp = np.repeat(feet.positions[:1].mean(axis=1), len(timing.time), axis=0)
     for begin, duration, start, target in _shifts(gait, feet):
         progress = (timing.time - begin) / duration
-        blend = minimum_jerk(progress) if gait.transfer == "smooth" else np.clip(progress, 0.0, 1.0)
+        is_smooth = gait.transfer == "smooth"
+        blend = minimum_jerk(progress) if is_smooth else np.clip(progress, 0.0, 1.0)
         zmp += blend[:, None] * (target - start)
     return zmp
 

@@ -60,11 +60,13 @@ def _solve_pose(tool: EndEffector, q: Array, place: Array, R_ref: Array) -> Arra
         position, R = tool.pose(q)
         error = place - position
         if keeps_orientation:
-            error = np.concatenate([error, Rotation.from_matrix(R_ref @ R.T).as_rotvec()])
+            turn = Rotation.from_matrix(R_ref @ R.T).as_rotvec()
+            error = np.concatenate([error, turn])
         if np.abs(error).max() < _TOLERANCE:
             return q
-        J_position, J_rotation = tool.jacobian(q)
-        J = np.concatenate([J_position, J_rotation]) if keeps_orientation else J_position
+        J, J_rotation = tool.jacobian(q)
+        if keeps_orientation:
+            J = np.concatenate([J, J_rotation])
         step: Array = J.T @ np.linalg.solve(J @ J.T + _DAMPING * np.eye(len(J)), error)
         q = q + step
     return None

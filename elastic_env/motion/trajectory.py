@@ -177,7 +177,8 @@ class PlanTable:
     def draw(self, world: int, generator: np.random.Generator) -> None:
         """Draw a new plan for one world."""
         if self._motion.is_random:
-            self.motion[world] = _motion_rows(self._motion.plan(generator, self._period))
+            plan = self._motion.plan(generator, self._period)
+            self.motion[world] = _motion_rows(plan)
 
 
 def _motion_rows(plan: Plan) -> Array:

@@ -126,8 +126,7 @@ class WalkPlan:
         origin = np.pad(self.origin, ((0, 0), (0, 1)))
         ankles = turn(self.ankles - origin[:, None], -self.heading[:, None])
         com = turn(self.com - origin[:, :2], -self.heading)
-        rows = np.arange(len(com))
-        lever = com - ankles[rows, self.timing.support, :2]
+        lever = com - ankles[np.arange(len(com)), self.timing.support, :2]
         across = np.stack([-lever[:, 1], lever[:, 0]], axis=-1)
         turning = self.heading_dot[:, None] * across
         return LocalPlan(
@@ -264,9 +263,10 @@ def require_feasible(plan: WalkPlan, biped: Biped, servos: tuple[Servo, ...]) ->
         if excess[row, joint] > 0.0:
             raise ConfigurationError(
                 f"the walk asks too much of joint {biped.joint_names[joint]!r} at"
-                f" {plan.timing.time[row]:.3f} s: it allows {limit} {sign * allowed[joint]:.3f}"
-                f" {unit}, the plan needs {sign * needed[row, joint]:.3f} {unit}; use longer"
-                " durations, a lower lift or another hip height"
+                f" {plan.timing.time[row]:.3f} s: it allows {limit}"
+                f" {sign * allowed[joint]:.3f} {unit}, the plan needs"
+                f" {sign * needed[row, joint]:.3f} {unit}; use longer durations, a lower"
+                " lift or another hip height"
             )
 
 
@@ -322,17 +322,17 @@ def _joint_angles(biped: Biped, pelvis: Array, feet: Feet, time: Array) -> Array
 
 def _reach_error(biped: Biped, pelvis: Array, feet: Feet, time: Array) -> ConfigurationError:
     """Return the error for the foot that is farthest out of reach, and parameters to lower."""
-    from_pelvis = turn(feet.ankles - pelvis[:, None], -feet.heading[:, None])
-    from_hip = from_pelvis - biped.hips
+    from_hip = turn(feet.ankles - pelvis[:, None], -feet.heading[:, None]) - biped.hips
     reach = biped.leg.reach
     distance = np.linalg.norm(from_hip, axis=-1)
     row, leg = np.unravel_index(int(np.argmax(distance)), distance.shape)
     x, y, z = from_hip[row, leg]
     vertical = "lift_m" if z > 0.0 else "hip_height_m"
+    is_wide = np.ptp(feet.ankles[0, :, 1]) > np.ptp(biped.hips[:, 1])
     # distance without the part of each parameter: below the reach, the parameter can cure it
     other_parts = {
         vertical: np.hypot(x, y),
-        "hip_half_spacing": np.hypot(x, z),
+        "step_width_m" if is_wide else "hip_half_spacing": np.hypot(x, z),
         "step_length_m": np.hypot(y, z),
     }
     cures = [name for name, rest in other_parts.items() if rest < reach]

@@ -67,7 +67,8 @@ class Sensor:
 
     def group(self, name: str, joints: Mirrors) -> SignalGroup:
         """Columns of the sensor on a robot with these joints."""
-        return SignalGroup.of(name, self.unit, self.meaning, self.axes or joints, "measured")
+        parts = self.axes or joints
+        return SignalGroup.of(name, self.unit, self.meaning, parts, "measured")
 
 
 SENSORS: Mapping[str, Sensor] = {
@@ -170,8 +171,8 @@ class FurtherSensors:
         for name, sensor in self._sensors.items():
             value = sensor.truth(truth) + self._offset[name]
             error = self._scale * sensor.noise * noise[name]
-            is_encoder = sensor.is_encoder
-            columns.append(quantise(value, self._count_rad) if is_encoder else value + error)
+            counts = self._count_rad
+            columns.append(quantise(value, counts) if sensor.is_encoder else value + error)
         self._last_values = self._values
         self._values = np.where(worlds[:, None], np.hstack(columns), self._values)
 

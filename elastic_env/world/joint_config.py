@@ -14,7 +14,7 @@ from elastic_env.motion.references import Hold, Reference
 from elastic_env.world.joint_signals import ACTION_BOUND_RAD
 from elastic_env.world.scenario import Scenario, make_scenario
 
-FRICTION_FIELDS = ("coulomb_friction", "viscous_friction", "load_friction", "static_friction")
+FRICTIONS = ("coulomb_friction", "viscous_friction", "load_friction", "static_friction")
 """Parameters of an `ElasticJoint` that are friction."""
 
 
@@ -55,7 +55,7 @@ class TaskConfig(Model):
     def with_ground_friction(self, joint: ElasticJoint) -> ElasticJoint:
         """Return an assumed joint with the share of friction that acts in the scenario's ground."""
         scale = self.scenario.friction_scale
-        friction = {name: scale * getattr(joint, name) for name in FRICTION_FIELDS}
+        friction = {name: scale * getattr(joint, name) for name in FRICTIONS}
         return joint.replace(**friction)
 
 
