@@ -27,8 +27,8 @@ def read_tensors(path: Path) -> tuple[dict[str, npt.NDArray[Any]], bytes]:
             kind = quote(tensor["dtype"])[1:-1]
             if kind not in _TYPES:
                 raise ConfigurationError(
-                    f"{path}: the tensor {quote(name)} must be of type {' or '.join(_TYPES)},"
-                    f" got {kind}"
+                    f"{path}: the tensor {quote(name)} must be of type"
+                    f" {' or '.join(_TYPES)}, got {kind}"
                 )
         return load(content), content
     except (OSError, SafetensorError) as error:

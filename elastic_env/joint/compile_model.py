@@ -67,8 +67,8 @@ def require_sound(model: MjModel, name: str) -> None:
         if wrong.size:
             kind = "body" if element == model.body else "joint"
             raise ConfigurationError(
-                f"{field} of {kind} {element(int(wrong[0])).name!r} of {name} must be finite"
-                f" and >= 0, got {quote(np.ravel(values[wrong[0]]).tolist())}"
+                f"{field} of {kind} {element(int(wrong[0])).name!r} of {name} must be"
+                f" finite and >= 0, got {quote(np.ravel(values[wrong[0]]).tolist())}"
             )
     if not np.isfinite(model.opt.gravity).all():
         raise ConfigurationError(

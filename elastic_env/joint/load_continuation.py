@@ -70,8 +70,8 @@ class LoadPath:
             if others:
                 rest = f"it can rest {' and '.join(others)}"
             return (
-                f"{question} At {100.0 * float(self.load[row][0]):.3g} % of the load K + ∂τ_g/∂q"
-                f" becomes singular: the link tips over, and {rest}"
+                f"{question} At {100.0 * float(self.load[row][0]):.3g} % of the load K"
+                f" + ∂τ_g/∂q becomes singular: the link tips over, and {rest}"
             )
         poses = " and ".join([f"at {self.q[(*row, joint)]:.4g} rad", *others])
         return f"{question} The pose is bistable: the link can rest {poses}"

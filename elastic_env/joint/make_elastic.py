@@ -159,14 +159,14 @@ def _choose_integrator(spec: MjSpec) -> None:
     model.opt.integrator = _IMPLICITFAST
     if not is_stable(model):
         raise ConfigurationError(
-            f"the elastic joints explode {step} with {names}; set spec.option.timestep to at most"
-            f" {round_below(largest_stable_timestep(model)):g} s before they are made elastic,"
-            " or give them more damping"
+            f"the elastic joints explode {step} with {names}; set spec.option.timestep"
+            f" to at most {round_below(largest_stable_timestep(model)):g} s before they"
+            " are made elastic, or give them more damping"
         )
     spec.option.integrator = _IMPLICITFAST
     warnings.warn(
-        f"the elastic joints explode with {integrator} {step}; the elastic model has the"
-        " integrator IMPLICITFAST, which follows them",
+        f"the elastic joints explode with {integrator} {step}; the elastic model has"
+        " the integrator IMPLICITFAST, which follows them",
         stacklevel=3,
     )
 

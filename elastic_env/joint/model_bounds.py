@@ -104,13 +104,13 @@ class _Counts:
         tag = element.tag
         if depth > model_text.DEEPEST:
             raise ConfigurationError(
-                f"{self.model.name} must be nested at most {model_text.DEEPEST} elements deep,"
-                " with includes"
+                f"{self.model.name} must be nested at most {model_text.DEEPEST}"
+                " elements deep, with includes"
             )
         if tag in _SOFT:
             raise ConfigurationError(
-                f"{self.model.name} has a deformable body (<{tag}>), whose forces on the links are"
-                " not known in advance; take it out of the model"
+                f"{self.model.name} has a deformable body (<{tag}>), whose forces on"
+                " the links are not known in advance; take it out of the model"
             )
         if tag == "replicate":
             copies *= max(_number(element.get("count", "1")), 1.0)
@@ -233,8 +233,8 @@ class _Counts:
         """Refuse a count or size above its bound."""
         if not value <= most:
             raise ConfigurationError(
-                f"{self.model.name} must have at most {most:.15g} {what}, copies counted, it has"
-                f" {value:.15g} or more; give a smaller model"
+                f"{self.model.name} must have at most {most:.15g} {what}, copies"
+                f" counted, it has {value:.15g} or more; give a smaller model"
             )
 
 

@@ -158,8 +158,8 @@ def _without_lost_meshes(read: Callable[[], MjSpec], name: str) -> ReadModel:
     model = compile_spec(_whole_copy(spec, name), name)
     if heavy:
         raise ConfigurationError(
-            f"body {heavy[0].name!r} of {name} has its mass from a mesh that cannot be read; give"
-            f" the body an <inertial>, or bring the mesh. {problem}"
+            f"body {heavy[0].name!r} of {name} has its mass from a mesh that cannot be"
+            f" read; give the body an <inertial>, or bring the mesh. {problem}"
         )
     return ReadModel(spec, model, name, lost)
 

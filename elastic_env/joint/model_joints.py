@@ -30,8 +30,8 @@ def has_nameless_hinge(model: MjModel) -> bool:
 def nameless_hinge() -> ConfigurationError:
     """Return the error for an elastic hinge without a name."""
     return ConfigurationError(
-        "a hinge of the model has no name; give each one, the stiffness is by name, or name the"
-        " joints that are elastic: the others are held"
+        "a hinge of the model has no name; give each one, the stiffness is by name, or"
+        " name the joints that are elastic: the others are held"
     )
 
 

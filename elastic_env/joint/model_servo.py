@@ -40,9 +40,9 @@ def position_servo(model: MjModel, joint: str) -> ModelServo | None:
     actuators = _actuators(model, joint)
     if (model.actuator_gaintype[actuators] == mujoco.mjtGain.mjGAIN_DCMOTOR).any():
         raise ConfigurationError(
-            f"joint {joint!r} has a dcmotor, whose gains are not read; give position_gain,"
-            " and `motor` with torque_constant, back_emf, resistance and voltage, under"
-            " `servo` of this joint in `joints`"
+            f"joint {joint!r} has a dcmotor, whose gains are not read; give"
+            " position_gain, and `motor` with torque_constant, back_emf, resistance and"
+            " voltage, under `servo` of this joint in `joints`"
         )
     position = [i for i in actuators if model.actuator_biasprm[i, 1] != 0.0]
     if not position:
@@ -136,8 +136,8 @@ def _limit(joint: str, scale: float, is_limited: bool, interval: Array) -> float
     lowest, highest = map(float, interval)
     if not lowest < 0.0 < highest:
         raise ConfigurationError(
-            f"a force range of joint {joint!r} is {lowest:g} to {highest:g}, and a servo has"
-            " to push both ways; give its torque_limit [N·m] under `servo` of this joint in"
-            " `joints`, or mend the range"
+            f"a force range of joint {joint!r} is {lowest:g} to {highest:g}, and a"
+            " servo has to push both ways; give its torque_limit [N·m] under `servo` of"
+            " this joint in `joints`, or mend the range"
         )
     return scale * min(-lowest, highest)

@@ -98,9 +98,9 @@ def require_stable(model: mujoco.MjModel, control_period_s: float) -> None:
     stable = stable_timestep(model, control_period_s)
     if stable < model.opt.timestep:
         raise ConfigurationError(
-            "the joints are too stiff, or their links or rotors too light, for timestep_s ="
-            f" {model.opt.timestep:g} s: the simulation would explode; the largest stable one is"
-            f" timestep_s = {stable:.12g} s"
+            "the joints are too stiff, or their links or rotors too light, for"
+            f" timestep_s = {model.opt.timestep:g} s: the simulation would explode; the"
+            f" largest stable one is timestep_s = {stable:.12g} s"
         )
 
 

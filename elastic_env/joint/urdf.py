@@ -31,8 +31,8 @@ def require_unique_names(text: ModelText) -> None:
         twice = [name for name, count in names.items() if count > 1 and name]
         if twice:
             raise ConfigurationError(
-                f"{text.name} has the {kind} {quote(twice[0])} {names[twice[0]]} times; give each"
-                f" {kind} its own name"
+                f"{text.name} has the {kind} {quote(twice[0])} {names[twice[0]]} times;"
+                f" give each {kind} its own name"
             )
 
 

@@ -189,8 +189,8 @@ class _Path(RepeatableReference):
         tool = workspace.end_effector
         if tool is None:
             raise ConfigurationError(
-                f"the reference {getattr(self, 'kind', '')!r} moves an end effector; name one,"
-                " end_effector=SITE"
+                f"the reference {getattr(self, 'kind', '')!r} moves an end effector;"
+                " name one, end_effector=SITE"
             )
         path = joint_path(tool, workspace.home, place, float(s.max()))
         q = path(s)

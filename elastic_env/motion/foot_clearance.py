@@ -31,8 +31,8 @@ def require_clear_feet(feet: Footholds, sole_half_size: tuple[float, float]) -> 
     if gap[step].min() <= 0.0:
         half_length, half_width = sole_half_size
         raise ConfigurationError(
-            f"the soles of {2 * half_length:g} m x {2 * half_width:g} m touch or cross in step"
-            f" {step + 1}; take a larger step_width_m or a smaller turn_rad"
+            f"the soles of {2 * half_length:g} m x {2 * half_width:g} m touch or cross"
+            f" in step {step + 1}; take a larger step_width_m or a smaller turn_rad"
         )
 
 

@@ -93,8 +93,8 @@ class Gait(Model):
         shortest = min(self.double_support_s, self.last_double_support_s)
         if self.transfer == "ramp" and shortest < _RAMP_SHIFT_S:
             raise ValueError(
-                f"the transfer 'ramp' shifts the ZMP in {_RAMP_SHIFT_S} s; a double support of"
-                f" {shortest} s is shorter"
+                f"the transfer 'ramp' shifts the ZMP in {_RAMP_SHIFT_S} s; a double"
+                f" support of {shortest} s is shorter"
             )
 
 
@@ -165,9 +165,9 @@ def step_timing(gait: Gait, control_period_s: float) -> Timing:
     period = first + single + last
     if gait.duration_s > LONGEST_WALK_S:
         raise ConfigurationError(
-            f"a walk must last at most {LONGEST_WALK_S:g} s with standing, {gait.num_steps} steps"
-            f" of {gait.step_period_s:g} s last {gait.duration_s:g} s; take fewer steps or shorter"
-            " ones"
+            f"a walk must last at most {LONGEST_WALK_S:g} s with standing,"
+            f" {gait.num_steps} steps of {gait.step_period_s:g} s last"
+            f" {gait.duration_s:g} s; take fewer steps or shorter ones"
         )
     time = control_times(gait.duration_s, control_period_s)
     begin = round(STAND_S / control_period_s)
@@ -314,8 +314,8 @@ def _whole_steps(name: str, duration_s: float, control_period_s: float) -> int:
         counts = {max(int(steps), 1), max(int(np.ceil(steps)), 1)}
         nearest = [f"{count * control_period_s:.10g} s" for count in sorted(counts)]
         raise ConfigurationError(
-            f"{name} must be a multiple of the control period of {control_period_s} s, got"
-            f" {duration_s} s; the nearest {'is' if len(nearest) == 1 else 'are'}"
+            f"{name} must be a multiple of the control period of {control_period_s} s,"
+            f" got {duration_s} s; the nearest {'is' if len(nearest) == 1 else 'are'}"
             f" {' and '.join(nearest)}"
         )
     return round(steps)

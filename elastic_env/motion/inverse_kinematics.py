@@ -43,9 +43,9 @@ def joint_path(tool: EndEffector, home: Array, place: Callable[[Array], Array], 
         q = _solve_pose(tool, angles[-1], start + offset, R)
         if q is None or np.abs(q - angles[-1]).max() > _LARGEST_JUMP_RAD:
             raise ConfigurationError(
-                f"the end effector cannot follow the path beyond {100 * at / end:.0f} % of it,"
-                f" {offset.round(3).tolist()} m from its start: out of reach, or a singular"
-                " posture; choose a smaller path or another home"
+                f"the end effector cannot follow the path beyond {100 * at / end:.0f} %"
+                f" of it, {offset.round(3).tolist()} m from its start: out of reach, or"
+                " a singular posture; choose a smaller path or another home"
             )
         angles.append(q)
     return CubicSpline(s, np.array(angles))

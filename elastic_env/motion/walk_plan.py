@@ -265,8 +265,8 @@ def require_feasible(plan: WalkPlan, biped: Biped, servos: tuple[Servo, ...]) ->
                 f"the walk asks too much of joint {biped.joint_names[joint]!r} at"
                 f" {plan.timing.time[row]:.3f} s: it allows {limit}"
                 f" {sign * allowed[joint]:.3f} {unit}, the plan needs"
-                f" {sign * needed[row, joint]:.3f} {unit}; use longer durations, a lower"
-                " lift or another hip height"
+                f" {sign * needed[row, joint]:.3f} {unit}; use longer durations, a"
+                " lower lift or another hip height"
             )
 
 
@@ -340,6 +340,6 @@ def _reach_error(biped: Biped, pelvis: Array, feet: Feet, time: Array) -> Config
     decimals = max(4, -int(np.floor(np.log10(excess))))
     return ConfigurationError(
         f"the {('left', 'right')[leg]} foot is out of reach at {time[row]:.3f} s:"
-        f" {distance[row, leg]:.{decimals}f} m from the hip to the ankle, at most {reach:g} m;"
-        f" lower {' or '.join(cures or [vertical])}"
+        f" {distance[row, leg]:.{decimals}f} m from the hip to the ankle, at most"
+        f" {reach:g} m; lower {' or '.join(cures or [vertical])}"
     )

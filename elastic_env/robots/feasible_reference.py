@@ -43,9 +43,9 @@ def home_error(robot: RobotModel, body: RigidBody, home: Array) -> Configuration
     weakest = int((needed / limits).argmax())
     return arm_references.WeakServosError(
         f"at home the weight takes {needed[weakest]:.4g} N·m of the servo of joint"
-        f" {robot.joint_names[weakest]!r}, which is limited to {limits[weakest]:.4g} N·m, and no"
-        " pose near home was found that is held with a fifth to spare: a simulated robot would"
-        " sink; raise its torque_limit, or choose another home"
+        f" {robot.joint_names[weakest]!r}, which is limited to {limits[weakest]:.4g}"
+        " N·m, and no pose near home was found that is held with a fifth to spare: a"
+        " simulated robot would sink; raise its torque_limit, or choose another home"
     )
 
 
@@ -103,9 +103,9 @@ def _require_torque(
         if np.any((needed_at_rest > limits_at_rest)[:, weakest[-1]]):
             cure = "the weight alone is too much: raise its torque_limit, or choose other poses"
         raise arm_references.WeakServosError(
-            f"the reference {config.reference.kind!r} can need {needed[weakest]:.4g} N·m of the"
-            f" servo of joint {robot.joint_names[weakest[-1]]!r}, which is limited to"
-            f" {limits[weakest]:.4g} N·m; {cure}"
+            f"the reference {config.reference.kind!r} can need {needed[weakest]:.4g}"
+            f" N·m of the servo of joint {robot.joint_names[weakest[-1]]!r}, which is"
+            f" limited to {limits[weakest]:.4g} N·m; {cure}"
         )
 
 
@@ -127,8 +127,8 @@ def warn_of_near_poses(
     if near.within_rad < type(near)().within_rad:
         changes.append(f"poses are drawn within {near.within_rad:.3g} rad of home")
     warnings.warn(
-        f"the servos are too weak for the usual {near.kind!r}; {' and '.join(changes)}. To choose"
-        " them, give within_rad, move_s or home",
+        f"the servos are too weak for the usual {near.kind!r}; {' and '.join(changes)}."
+        " To choose them, give within_rad, move_s or home",
         stacklevel=4,
     )
 

@@ -101,7 +101,7 @@ def require_torque(reference: Reference, needed: Array, limits: Array) -> None:
         weakest = np.unravel_index(np.argmax(needed - limits), needed.shape)
         extent = reference.extent()
         raise ConfigurationError(
-            f"the reference {reference.kind!r} can need {needed[weakest]:.4g} N·m of a servo"
-            f" limited to {limits[weakest]:.4g} N·m (|q| up to {extent.q:.2f} rad, |q̈| up to"
-            f" {extent.q_ddot:.2f} rad/s²); lower its amplitude or its rate"
+            f"the reference {reference.kind!r} can need {needed[weakest]:.4g} N·m of a"
+            f" servo limited to {limits[weakest]:.4g} N·m (|q| up to {extent.q:.2f} rad,"
+            f" |q̈| up to {extent.q_ddot:.2f} rad/s²); lower its amplitude or its rate"
         )

@@ -396,13 +396,13 @@ def _inertial_imu(config: JointConfig, plant: JointPlant, num_worlds: int) -> Pe
         return None
     if any(part.inertial_share < 1.0 for part in scenario.parts):
         raise ConfigurationError(
-            f"scenario {scenario.name!r} gives only some robots an IMU that computes its attitude;"
-            " only the walker supports that, set inertial_share to 0 or 1"
+            f"scenario {scenario.name!r} gives only some robots an IMU that computes"
+            " its attitude; only the walker supports that, set inertial_share to 0 or 1"
         )
     if plant.imu_arm_m is None:
         raise ConfigurationError(
-            f"scenario {scenario.name!r} is about the IMU on a link, which {plant.name} does"
-            " not have; choose another one, or the testbed or the walker"
+            f"scenario {scenario.name!r} is about the IMU on a link, which {plant.name}"
+            " does not have; choose another one, or the testbed or the walker"
         )
     gravity = float(np.linalg.norm(plant.model.opt.gravity))
     return PendulumImu(

@@ -211,8 +211,8 @@ def with_stiffness(
     values = np.asarray(stiffness, dtype=np.float64)
     if values.shape not in {(), (len(joints),)}:
         raise ConfigurationError(
-            f"stiffness must be one number or {len(joints)} of them [N·m/rad], one per joint "
-            f"({', '.join(joints)}), got an array of shape {values.shape}"
+            f"stiffness must be one number or {len(joints)} of them [N·m/rad], one per"
+            f" joint ({', '.join(joints)}), got an array of shape {values.shape}"
         )
     each = np.broadcast_to(values, (len(joints),))
     return {
@@ -273,6 +273,6 @@ def read_stiffness(value: Stiffness) -> "float | Array":
         return float(parse_json(content.decode("utf-8"))[STIFFNESS_KEY])
     except (KeyError, TypeError, ValueError):
         raise ConfigurationError(
-            f"{path} is no identification: it must be JSON with a number {STIFFNESS_KEY!r}, see"
-            " `elastic identify`"
+            f"{path} is no identification: it must be JSON with a number"
+            f" {STIFFNESS_KEY!r}, see `elastic identify`"
         ) from None

@@ -236,8 +236,8 @@ class WarpWorlds(Worlds):
         """Give every world a row of a field of the model on the device."""
         if field not in _WORLD_FIELDS:
             raise ConfigurationError(
-                f'in the backend "warp" all worlds have the same {field}; choose the backend'
-                ' "mujoco" for models that differ in it'
+                f'in the backend "warp" all worlds have the same {field}; choose the'
+                ' backend "mujoco" for models that differ in it'
             )
         shared = getattr(self._model, field)
         shape = (self.num_worlds, *shared.shape[1:])

@@ -119,11 +119,11 @@ def configure_robot(
             rigid = robot.rigid().compile()
             name, inertia = assumptions.lightest_links(rigid, config.joints)
             raise ConfigurationError(
-                "the joints are too stiff, or their links or rotors too light: in simulation they"
-                f" explode with a physics step of {shortest_s:g} s, the shortest that is played;"
-                " give them less stiffness, or more rotor_inertia. Of the links the fastest are"
-                f" those of joint {name!r}: {inertia:.3g} kg·m² on a spring of"
-                f" {config.joints[name].stiffness:g} N·m/rad"
+                "the joints are too stiff, or their links or rotors too light: in"
+                f" simulation they explode with a physics step of {shortest_s:g} s, the"
+                " shortest that is played; give them less stiffness, or more rotor_inertia."
+                f" Of the links the fastest are those of joint {name!r}: {inertia:.3g}"
+                f" kg·m² on a spring of {config.joints[name].stiffness:g} N·m/rad"
             )
         config = config.replace(timestep_s=timestep_s)
     return config

@@ -80,14 +80,14 @@ def elastic_settings(
             elastic[name] = settings
         elif np.isfinite(gain):
             raise ConfigurationError(
-                f"joint {name!r} is rigid and its servo gives way, which is not simulated; give it"
-                f" a stiffness K [N·m/rad] well above its position_gain of {gain:g}, such as"
-                f" {STIFF_OVER_SERVO * gain:g}"
+                f"joint {name!r} is rigid and its servo gives way, which is not"
+                " simulated; give it a stiffness K [N·m/rad] well above its"
+                f" position_gain of {gain:g}, such as {STIFF_OVER_SERVO * gain:g}"
             )
     if not elastic:
         raise ConfigurationError(
-            f"joints gives no joint its stiffness K [N·m/rad]; choose from {', '.join(hinges)}, or"
-            f" '*' for all. {joint_settings.CURE}"
+            "joints gives no joint its stiffness K [N·m/rad]; choose from"
+            f" {', '.join(hinges)}, or '*' for all. {joint_settings.CURE}"
         )
     return elastic
 
@@ -238,8 +238,8 @@ class _JointBuilder:
         is_of_links = most == self.links.most
         scale = "its links have" if is_of_links else "its velocity gain needs"
         self.notes.append(
-            f"rotor_inertia of {self.name} {most:.3g} kg·m², as much as {scale}, as K/(100 rad/s)²"
-            f" would be {by_frequency:.3g}"
+            f"rotor_inertia of {self.name} {most:.3g} kg·m², as much as {scale}, as"
+            f" K/(100 rad/s)² would be {by_frequency:.3g}"
         )
         return most
 
@@ -284,8 +284,8 @@ class _JointBuilder:
             kv = max(critical - back_emf, 0.0)
             if known.position_gain is not None and not is_given:
                 self.notes.append(
-                    f"velocity_gain of {self.name} {kv:.3g} N·m·s/rad, critical damping, as"
-                    " nothing in the model damps its servo"
+                    f"velocity_gain of {self.name} {kv:.3g} N·m·s/rad, critical"
+                    " damping, as nothing in the model damps its servo"
                 )
         enough = _TORQUE_RESERVE * links.torque + _RESERVE_RAD_S2 * (rotor + links.most)
         limit = known.torque_limit

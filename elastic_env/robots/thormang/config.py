@@ -85,8 +85,8 @@ class WalkConfig(TaskConfig):
             raise ValueError("fewest_steps is for walks in place, whose strides are all alike")
         if fewest > most or (most - fewest) % 2:
             raise ValueError(
-                f"fewest_steps must be num_steps = {most} less whole strides of two steps, got"
-                f" {fewest}"
+                f"fewest_steps must be num_steps = {most} less whole strides of two"
+                f" steps, got {fewest}"
             )
         frictions = {part.friction_scale: part.name for part in self.scenarios}
         rates = {part.pelvis_imu.rate_hz: part.name for part in self.scenarios}

@@ -158,7 +158,7 @@ class WalkTruth:
         model, *others = self.models
         if others:
             raise ConfigurationError(
-                f"the worlds of {len(self.models)} scenarios have no true model in common; make an"
-                " environment for each"
+                f"the worlds of {len(self.models)} scenarios have no true model in"
+                " common; make an environment for each"
             )
         return model
