@@ -142,7 +142,6 @@ def require_memory(name: str, worlds: int, world_bytes: int) -> None:
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     if needed > memory:
         raise ConfigurationError(
-            f"{quote(worlds)} worlds take about {quote(needed // 10**9)} GB of memory,"
-            f" this computer has {memory / 1e9:.1f} GB; set {name} to at most"
-            f" {memory // world_bytes}"
+            f"{quote(worlds)} worlds take about {quote(needed // 10**9)} GB of memory, this"
+            f" computer has {memory / 1e9:.1f} GB; set {name} to at most {memory // world_bytes}"
         )

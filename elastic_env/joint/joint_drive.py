@@ -48,9 +48,8 @@ def drive_joint(
     elif servo is not None:
         names = ", ".join(repr(actuator.name) for actuator in existing)
         warnings.warn(
-            f"the hinge {name!r} keeps its actuator {names}, so that its servo is left"
-            " out; choose actuators='replace' for the servo in its place, or give the"
-            " joint servo=None",
+            f"the hinge {name!r} keeps its actuator {names}, so that its servo is left out; choose"
+            " actuators='replace' for the servo in its place, or give the joint servo=None",
             stacklevel=4,
         )
     kind = mujoco.mjtSensor.mjSENS_JOINTACTFRC

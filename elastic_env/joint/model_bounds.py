@@ -94,12 +94,7 @@ class _Counts:
             self._folders += [compiler.get(key, "") for key in FOLDERS]
 
     def _count(
-        self,
-        element: ET.Element,
-        files: Files,
-        copies: float,
-        in_world: bool,
-        depth: int,
+        self, element: ET.Element, files: Files, copies: float, in_world: bool, depth: int
     ) -> None:
         tag = element.tag
         if depth > model_text.DEEPEST:

@@ -115,9 +115,8 @@ def require_known_torque(model: MjModel, joints: Sequence[str]) -> None:
         affected, ends = affected_joints.equality_joints(model, e)
         if affected & ids:
             raise ConfigurationError(
-                f"the model has an equality constraint of {ends}, whose torque is not"
-                " known in advance; take it out of the"
-                f" model{_hold_cure(model, affected & ids, ids)}"
+                f"the model has an equality constraint of {ends}, whose torque is not known in"
+                f" advance; take it out of the model{_hold_cure(model, affected & ids, ids)}"
             )
     for t in range(model.ntendon):
         affected = affected_joints.tendon_joints(model, t) & ids

@@ -263,10 +263,9 @@ def require_feasible(plan: WalkPlan, biped: Biped, servos: tuple[Servo, ...]) ->
         if excess[row, joint] > 0.0:
             raise ConfigurationError(
                 f"the walk asks too much of joint {biped.joint_names[joint]!r} at"
-                f" {plan.timing.time[row]:.3f} s: it allows {limit}"
-                f" {sign * allowed[joint]:.3f} {unit}, the plan needs"
-                f" {sign * needed[row, joint]:.3f} {unit}; use longer durations, a"
-                " lower lift or another hip height"
+                f" {plan.timing.time[row]:.3f} s: it allows {limit} {sign * allowed[joint]:.3f}"
+                f" {unit}, the plan needs {sign * needed[row, joint]:.3f} {unit}; use longer"
+                " durations, a lower lift or another hip height"
             )
 
 

@@ -95,8 +95,7 @@ class FloatingBody:
         """Inertia of base translation, base rotation, hinges: (n,) [rad] to (6 + n, 6 + n) [SI]."""
         rows = np.concatenate([np.arange(self._base_v, self._base_v + 6), self._v])
         full = pinocchio.crba(self._model, self._data, self._position(q))
-        upper = np.triu(full)
-        return (upper + np.triu(full, 1).T)[np.ix_(rows, rows)]
+        return (np.triu(full) + np.triu(full, 1).T)[np.ix_(rows, rows)]
 
     def center_of_mass(self, q: Array) -> Array:
         """Center of mass of the robot in the frame of the base, (N, n) [rad] to (N, 3) [m]."""

@@ -37,10 +37,7 @@ class LegChains:
     """
 
     def __init__(
-        self,
-        model: mujoco.MjModel,
-        legs: Sequence[Sequence[str]],
-        weightless: Sequence[int] = (),
+        self, model: mujoco.MjModel, legs: Sequence[Sequence[str]], weightless: Sequence[int] = ()
     ) -> None:
         model_copy = copy.copy(model)
         model_copy.body_mass[list(weightless)] = 0.0

@@ -283,13 +283,7 @@ def begin_links(qpos: Array, qvel: Array, step: Any, links: Any, worlds: BoolArr
 
 @compiled
 def sense_links(
-    qpos: Array,
-    qvel: Array,
-    step: Any,
-    links: Any,
-    control: Any,
-    first: int,
-    stride: int,
+    qpos: Array, qvel: Array, step: Any, links: Any, control: Any, first: int, stride: int
 ) -> bool:
     """Process links on a fixed base after the physics: read, measure, end, score, observe.
 

@@ -73,10 +73,7 @@ class Sensor:
 
 SENSORS: Mapping[str, Sensor] = {
     "link_encoder": Sensor(
-        "rad",
-        "encoder on the link, q in whole counts",
-        lambda truth: truth.q,
-        is_encoder=True,
+        "rad", "encoder on the link, q in whole counts", lambda truth: truth.q, is_encoder=True
     ),
     "joint_torque": Sensor(
         "N·m",
