@@ -45,7 +45,7 @@ def compiled_part(function: Callable[_P, _R]) -> Callable[_P, _R]:
     It has no entry for Python: so all kernels compile in five sixths of the time.
     """
     kernel = _compile(function, no_cpython_wrapper=True)
-    return function if kernel is function else _Part(kernel)  # Numba may be switched off
+    return function if kernel is function else _Part(kernel)  # Numba may be off
 
 
 def _compile(function: Callable[_P, _R], **options: Any) -> Any:

@@ -11,8 +11,9 @@ from pathlib import Path
 from typing import Annotated, Any, Self, TypeVar
 
 import numpy as np
+import pydantic
 import yaml
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import AfterValidator, BaseModel, Field, ValidationError
 from pydantic_core import CoreSchema
 from pydantic_core.core_schema import no_info_before_validator_function
 
@@ -90,7 +91,7 @@ class Model(BaseModel):
     A number is one of Python or NumPy, also in an array, but neither text nor a truth value.
     """
 
-    model_config = ConfigDict(
+    model_config = pydantic.ConfigDict(
         frozen=True,
         extra="forbid",
         allow_inf_nan=False,
@@ -108,7 +109,7 @@ class Model(BaseModel):
     def _check(self) -> None:
         """Refuse parameters that contradict each other, by a ValueError."""
 
-    @model_validator(mode="after")
+    @pydantic.model_validator(mode="after")
     def _check_together(self) -> Self:
         self._check()
         return self

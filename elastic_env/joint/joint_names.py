@@ -29,9 +29,9 @@ def friction_name(joint: str) -> str:
     return f"{joint}_dry_friction"
 
 
-def part_names(joint: str) -> tuple[str, ...]:
+def part_names(name: str) -> tuple[str, ...]:
     """Names of all these parts."""
-    return motor_name(joint), spring_name(joint), servo_name(joint), friction_name(joint)
+    return motor_name(name), spring_name(name), servo_name(name), friction_name(name)
 
 
 @dataclass(frozen=True)

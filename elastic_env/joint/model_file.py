@@ -182,7 +182,7 @@ def _whole_copy(spec: MjSpec, name: str) -> MjSpec:
 def _bodies_with_mesh_mass(spec: MjSpec) -> list[mujoco.MjsBody]:
     """Return the bodies whose mass comes from a mesh."""
     from_geoms = spec.compiler.inertiafromgeom == _FROM_GEOMS.mjINERTIAFROMGEOM_TRUE
-    bodies = [body for body in spec.bodies[1:] if from_geoms or not body.explicitinertial]
+    bodies = [b for b in spec.bodies[1:] if from_geoms or not b.explicitinertial]
     return [body for body in bodies if any(map(_uses_mesh, body.geoms))]
 
 

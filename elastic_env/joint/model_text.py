@@ -220,7 +220,7 @@ def _require_model(model: ModelText) -> None:
     if model.is_urdf:
         for element in _robot_parts(root):
             values = element.attrib.values()
-            first = next((value for value in values if _PLACEHOLDER.search(value)), None)
+            first = next((text for text in values if _PLACEHOLDER.search(text)), None)
             if first is not None:
                 problem = f"{name} has {quote(first)} in <{element.tag}>, of xacro"
                 raise ConfigurationError(f"{problem}; {_EXPAND}")

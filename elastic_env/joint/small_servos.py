@@ -95,7 +95,7 @@ class SmallServo:
 
 
 def _read_servo(row: dict[str, str]) -> SmallServo:
-    figures = {column: float(value) for column, value in row.items() if column != "name"}
+    figures = {key: float(value) for key, value in row.items() if key != "name"}
     motor = Motor(**{name: figures.pop(name) for name in Motor.model_fields})
     return SmallServo(motor, **figures)
 

@@ -40,7 +40,7 @@ def joint_path(tool: EndEffector, home: Array, place: Callable[[Array], Array], 
     start, R = tool.pose(home)
     angles = [home]
     for at, offset in zip(s[1:], place(s[1:]), strict=True):
-        q = _solve_pose(tool, angles[-1], start + offset, R)
+        q = _solve(tool, angles[-1], start + offset, R)
         if q is None or np.abs(q - angles[-1]).max() > _LARGEST_JUMP_RAD:
             raise ConfigurationError(
                 f"the end effector cannot follow the path beyond {100 * at / end:.0f} %"
@@ -51,7 +51,7 @@ def joint_path(tool: EndEffector, home: Array, place: Callable[[Array], Array], 
     return CubicSpline(s, np.array(angles))
 
 
-def _solve_pose(tool: EndEffector, q: Array, place: Array, R_ref: Array) -> Array | None:
+def _solve(tool: EndEffector, q: Array, place: Array, R_ref: Array) -> Array | None:
     """Find angles near q that reach a place, or None; six joints or more keep the orientation."""
     from scipy.spatial.transform import Rotation
 

@@ -165,7 +165,7 @@ def plan_walk(gait: Gait, biped: Biped, control_period_s: float) -> WalkPlan:
     motion = follow_zmp(preview, zmp, zmp[0])
     start = turn(np.tile(standing, (len(zmp), 1)), feet.heading)
     start[:, :2] += feet.ankles[..., :2].mean(axis=1)
-    pelvis = _pelvis_under(motion.com, start, biped, feet, timing.time)
+    pelvis = _find_pelvis(motion.com, start, biped, feet, timing.time)
     q = _joint_angles(biped, pelvis, feet, timing.time)
     dynamics = walk_dynamics(biped, pelvis, feet.heading, q, control_period_s)
     q_dot, q_ddot = derivatives(q, control_period_s)
@@ -218,7 +218,7 @@ def refine_plan(plan: WalkPlan, biped: Biped, control_period_s: float) -> WalkPl
     from_pelvis = turn(biped.chains.center_of_mass(plan.q), plan.heading)
     com = (plan.pelvis + from_pelvis)[:, :2] + correction.com
     feet = Feet(plan.ankles, plan.foot_yaw, plan.heading)
-    pelvis = _pelvis_under(com, plan.pelvis, biped, feet, plan.timing.time)
+    pelvis = _find_pelvis(com, plan.pelvis, biped, feet, plan.timing.time)
     q = _joint_angles(biped, pelvis, feet, plan.timing.time)
     q_dot, q_ddot = derivatives(q, control_period_s)
     refined = replace(
@@ -288,13 +288,13 @@ def _standing_pelvis(gait: Gait, biped: Biped, zmp: Array, feet: Feet) -> tuple[
     """Return the pelvis over the ZMP at rest, and the height of the center of mass."""
     start = np.array([[*zmp, gait.hip_height_m]])
     begin = np.zeros(1)
-    pelvis = _pelvis_under(zmp[None], start, biped, feet, begin)
+    pelvis = _find_pelvis(zmp[None], start, biped, feet, begin)
     q = _joint_angles(biped, pelvis, feet, begin)
     com = pelvis + turn(biped.chains.center_of_mass(q), feet.heading)
     return pelvis[0], float(com[0, 2])
 
 
-def _pelvis_under(com: Array, start: Array, biped: Biped, feet: Feet, t: Array) -> Array:
+def _find_pelvis(com: Array, start: Array, biped: Biped, feet: Feet, t: Array) -> Array:
     """Find the pelvis of one height that brings the center of mass to its reference."""
     pelvis = np.array(start)
     error = np.full(1, np.inf)

@@ -32,11 +32,12 @@ from elastic_env.rendering.side_by_side import DisplayRobot, Sides
 from elastic_env.rigid.rigid_body import RigidBody
 from elastic_env.rigid.tree.end_effector import EndEffector
 from elastic_env.robots import deviations, feasible_reference
+from elastic_env.world import robot_model
 from elastic_env.world.further_sensors import ACCELEROMETER, add_accelerometer
 from elastic_env.world.joint_config import FRICTIONS, JointConfig, RewardWeights
 from elastic_env.world.joint_signals import ACTION_BOUND_RAD
 from elastic_env.world.joint_task import JointPlant, JointTask
-from elastic_env.world.robot_model import RobotModel, joint_ranges, read_stiffness, with_stiffness
+from elastic_env.world.robot_model import RobotModel, joint_ranges
 from elastic_env.world.scenario import Scenario, make_scenario
 
 _REFERENCE = "elastic_env_reference_"
@@ -128,7 +129,8 @@ class JointRobot:
         """
         joints = dict(self.joints)
         if stiffness is not None:
-            joints = with_stiffness(joints, read_stiffness(stiffness))
+            value = robot_model.read_stiffness(stiffness)
+            joints = robot_model.with_stiffness(joints, value)
         return JointRobotConfig(
             robot=self,
             reference=arm_references.make_arm_reference(reference),
@@ -207,8 +209,8 @@ class JointRobot:
                 feasible_reference.plan_motion(changed, true, body, workspace)
             except arm_references.WeakServosError:
                 continue
-            old_home = config.robot.home
-            feasible_reference.warn_of_near_poses(true.joint_names, near, old_home, home)
+            before = config.robot.home
+            feasible_reference.warn_of_near_poses(true.joint_names, near, before, home)
             return changed
         raise weak_servos
 

@@ -653,7 +653,7 @@ def update_foot_drift(row: Any, planned: Any) -> None:
 
 
 @compiled_part
-def compute_foot_drift(force: Array, ankle: Array, planned: Array, drift: Array) -> None:
+def compute_foot_drift(force: Array, ankle: Array, plan: Array, drift: Array) -> None:
     r"""Compute the displacement of standing feet against the plan: into `drift`, (2,) [m].
 
     .. math:: d = \sum_i w_i \, (p_i - p_{i, plan}), \quad w_i = F_{z, i} / \sum_j F_{z, j}
@@ -668,7 +668,7 @@ def compute_foot_drift(force: Array, ankle: Array, planned: Array, drift: Array)
     for i in range(2):
         total = 0.0 if carried > 0.0 else np.nan
         for foot in range(len(force)):
-            total += force[foot] / carried * (ankle[foot, i] - planned[foot, i])
+            total += force[foot] / carried * (ankle[foot, i] - plan[foot, i])
         drift[i] = total
 
 

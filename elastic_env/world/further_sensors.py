@@ -167,9 +167,9 @@ class FurtherSensors:
         columns = []
         for name, sensor in self._sensors.items():
             value = sensor.truth(truth) + self._offset[name]
-            error = self._scale * sensor.noise * noise[name]
+            noisy = value + self._scale * sensor.noise * noise[name]
             counts = self._count_rad
-            columns.append(quantise(value, counts) if sensor.is_encoder else value + error)
+            columns.append(quantise(value, counts) if sensor.is_encoder else noisy)
         self._last_values = self._values
         self._values = np.where(worlds[:, None], np.hstack(columns), self._values)
 

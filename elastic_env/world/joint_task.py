@@ -405,6 +405,5 @@ def _inertial_imu(config: JointConfig, plant: JointPlant, num_worlds: int) -> Pe
             " does not have; choose another one, or the testbed or the walker"
         )
     gravity = float(np.linalg.norm(plant.model.opt.gravity))
-    arm_m = plant.imu_arm_m
-    period_s = config.control_period_s
-    return PendulumImu(scenario.inertial, arm_m, gravity, period_s, num_worlds)
+    place = (plant.imu_arm_m, gravity, config.control_period_s)
+    return PendulumImu(scenario.inertial, *place, num_worlds)

@@ -43,7 +43,8 @@ _JOINT_TRUTH = record_type(
     *floats("stiffness damping"),  # true K [N·m/rad] and D [N·m·s/rad]
     *floats("backlash homing"),  # dead band, and the encoder's offset from θ [rad]
 )
-_JOINT_MEASUREMENTS = record_type(*floats("encoder last_encoder"))  # now, a step ago [rad]
+# now, and a step ago [rad]
+_JOINT_MEASUREMENTS = record_type(*floats("encoder last_encoder"))
 JOINT = record_type(("truth", _JOINT_TRUTH), ("measured", _JOINT_MEASUREMENTS))
 """A joint in a control step. Spring, backlash and homing error are drawn per episode."""
 

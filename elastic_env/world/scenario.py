@@ -123,7 +123,7 @@ _LONGEST_NAME = 1000
 DISTRIBUTIONS = ("drawn", "drawn_beyond")
 """Changes that draw every episode's robot from ranges: `drawn` to learn from; `drawn_beyond` for
 tests, where each robot has one quantity beyond the ranges of `drawn`."""
-WALKER_ONLY = [name for name, sets in CHANGES.items() if sets.keys() <= {*WALKER_FIELDS}]
+WALKER_ONLY = [key for key, sets in CHANGES.items() if sets.keys() <= {*WALKER_FIELDS}]
 """Changes that set only quantities of walkers."""
 
 RangeChanges = Mapping[str, Any] | Sequence[Mapping[str, Any]]
@@ -159,7 +159,7 @@ def _require_ranges(ranges: Any, walks: bool) -> None:
     fields = {field for mapping in mappings for field in mapping}
     walker_fields = sorted(fields & {*WALKER_FIELDS})
     if walker_fields and not walks:
-        choices = [name for name in RobotRanges.model_fields if name not in WALKER_FIELDS]
+        choices = [key for key in RobotRanges.model_fields if key not in WALKER_FIELDS]
         problem = f"ranges: only a walker has {', '.join(walker_fields)}"
         raise ConfigurationError(f"{problem}; here choose from: {', '.join(choices)}")
 

@@ -100,8 +100,7 @@ class InertialSensor(Model):
     @property
     def offset_rad(self) -> float:
         """Standard deviation of the offset of roll and pitch [rad]."""
-        rest = self.static_error_rad**2 - self._bias_tilt_rad**2
-        return math.sqrt(max(rest, 0.0))
+        return math.sqrt(max(self.static_error_rad**2 - self._bias_tilt_rad**2, 0.0))
 
     @property
     def _bias_tilt_rad(self) -> float:

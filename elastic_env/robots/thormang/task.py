@@ -121,14 +121,14 @@ class WalkTask(Task):
             joints=tables.JOINTS,
             scenarios=scenarios,
             metrics=tables.METRICS,
-            kinds=[(kind.encoder_counts, is_late) for kind, is_late, _ in self._variants],
+            kinds=[(kind.encoder_counts, late) for kind, late, _ in self._variants],
         )
         table = self.observation_table
         by_scenario = {kind.config.scenario: kind for kind in kinds}
         self.plan = plan
         self._kinds = kinds
-        models = [kind.true_model for kind in kinds]
-        self._true_models = tuple(model.with_observation_table(table) for model in models)
+        models = [kind.true_model.with_observation_table(table) for kind in kinds]
+        self._true_models = tuple(models)
         self._kind_of_world = [by_scenario[scenario] for scenario in scenarios]
         self._torso = self.model.body("upper_body").id
         self._phases = constants.phase_masks(plan)
@@ -142,7 +142,7 @@ class WalkTask(Task):
         self._inertial = constants.inertial_constants(self._variants, robot.gravity)
         self._plan_rows = constants.plan_rows(plan, config)
         self._walk_columns = first_columns(table, records.COLUMNS)
-        self._has_pushes = any(each.push_n > 0.0 for kind in kinds for each in kind.bank)
+        self._has_push = any(each.push_n > 0.0 for kind in kinds for each in kind.bank)
         push_s = np.array([scenario.push_s for scenario in scenarios])
         self._push_steps = (push_s / period_s).round()
         self._push_force = np.zeros((num_worlds, 3))
@@ -237,7 +237,7 @@ class WalkTask(Task):
 
     def _disturb(self) -> None:
         """Push the torso during the drawn time."""
-        if self._has_pushes:
+        if self._has_push:
             steps = self._worlds[self._row]["truth"]["step"] - self._push_begin
             is_pushed = (steps >= 0) & (steps < self._push_steps)
             force = np.where(is_pushed[:, None], self._push_force, 0.0)
