@@ -537,7 +537,7 @@ def test_a_foot_out_of_reach_is_an_error_that_says_when(hip_height: float, messa
         ({"hip_height_m": 0.69}, 0.105, "hip_height_m or hip_half_spacing"),
         ({"lift_m": 5.0}, 0.105, "lift_m"),
         ({}, 5.0, "hip_half_spacing"),
-        ({"step_width_m": 1.0}, 0.105, "step_width_m"),
+        ({"step_width_m": 1.0}, 0.105, "hip_height_m or step_width_m"),
     ],
 )
 def test_advice_for_a_foot_out_of_reach_names_what_helps(
