@@ -206,7 +206,7 @@ class DrawnRobot:
     floor_friction: float
 
     def with_exact_sensors(self) -> "DrawnRobot":
-        """Return the robot without push and errors of IMU and feet; it stands as this one does."""
+        """Return the robot without push and errors of IMU and feet; it rests at the same place."""
         feet: dict[str, Any] = dict.fromkeys(FOOT_ERRORS, (0.0,))
         others = {"push_n": 0.0, "is_delayed": False, "is_inertial": False}
         return replace(self, mounting_rad=(0.0, 0.0), **others, **feet)

@@ -52,10 +52,10 @@ def make_elastic(
 ) -> MjSpec:
     """Return a copy of a specification in which the named hinges are elastic.
 
-    A hinge keeps its limits, springs, damping and friction on the link (the joint's friction is
-    added), sensors and equalities on the link angle, and actuators on the rotor. The rotor inertia
-    replaces its armature, which stands for the rotor. Keyframes get the rotors at their link
-    angles, without deflection.
+    Limits, springs, damping and friction of a hinge stay on the link; the joint's friction is added.
+    Sensors and equalities stay on the link angle, actuators move to the rotor. The rotor inertia
+    replaces the armature of the hinge. Keyframes get the rotors at their link angles, without
+    deflection.
 
     The elastic model follows its springs at the physics step of the model. The integrator becomes
     `implicitfast` where the model's own does not follow them. MuJoCo's automatic reset is off, so
@@ -68,8 +68,8 @@ def make_elastic(
     `Robot-v0` and `PositionCompensator` refuse, since these must know every torque in advance:
     floating bases and ball joints; loops and other equality constraints; tendons that pull; drives
     by a tendon, a site or a slider-crank; springs that are not linear; deformable bodies, plugins
-    and wind; and a flag that turns gravity off. `elastic_env.joint.supported_models` has their
-    checks. All three refuse models that contradict themselves, that have no hinge, or whose flags
+    and wind; and a flag that turns gravity off. `elastic_env.joint.supported_models` has the
+    checks of both. All three refuse models that contradict themselves, that have no hinge, or whose flags
     turn springs, dampers, the servo or the friction of the joints off.
 
     Args:
