@@ -52,10 +52,10 @@ def make_elastic(
 ) -> MjSpec:
     """Return a copy of a specification in which the named hinges are elastic.
 
-    Limits, springs, damping and friction of a hinge stay on the link; the joint's friction is added.
-    Sensors and equalities stay on the link angle, actuators move to the rotor. The rotor inertia
-    replaces the armature of the hinge. Keyframes get the rotors at their link angles, without
-    deflection.
+    Limits, springs, damping and friction of a hinge stay on the link. The joint's friction is
+    added. Sensors and equalities stay on the link angle, actuators move to the rotor. The rotor
+    inertia replaces the armature of the hinge. Keyframes get the rotors at their link angles,
+    without deflection.
 
     The elastic model follows its springs at the physics step of the model. The integrator becomes
     `implicitfast` where the model's own does not follow them. MuJoCo's automatic reset is off, so
@@ -69,8 +69,8 @@ def make_elastic(
     floating bases and ball joints; loops and other equality constraints; tendons that pull; drives
     by a tendon, a site or a slider-crank; springs that are not linear; deformable bodies, plugins
     and wind; and a flag that turns gravity off. `elastic_env.joint.supported_models` has the
-    checks of both. All three refuse models that contradict themselves, that have no hinge, or whose flags
-    turn springs, dampers, the servo or the friction of the joints off.
+    checks of both. All three refuse models that contradict themselves, that have no hinge, or whose
+    flags turn springs, dampers, the servo or the friction of the joints off.
 
     Args:
         spec: Any specification with hinges, a file of MJCF or URDF, or the text of one, see
