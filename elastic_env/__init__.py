@@ -75,5 +75,5 @@ IDS: dict[str, str] = {}
 for _name in _ENVIRONMENTS:
     _package = import_module(_name)
     IDS[_package.NAME] = _package.ID
-    _entry_point = f"{_name}.environment:make"
-    gymnasium.register(_package.ID, _entry_point, vector_entry_point=f"{_entry_point}_vector")
+    _make = f"{_name}.environment:make"
+    gymnasium.register(_package.ID, _make, vector_entry_point=f"{_make}_vector")

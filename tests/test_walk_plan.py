@@ -537,13 +537,14 @@ def test_a_foot_out_of_reach_is_an_error_that_says_when(hip_height: float, messa
         ({"hip_height_m": 0.69}, 0.105, "hip_height_m or hip_half_spacing"),
         ({"lift_m": 5.0}, 0.105, "lift_m"),
         ({}, 5.0, "hip_half_spacing"),
+        ({"step_width_m": 1.0}, 0.105, "hip_height_m or step_width_m"),
     ],
 )
 def test_advice_for_a_foot_out_of_reach_names_what_helps(
     gait: dict[str, float], hip_half_spacing: float, advice: str
 ) -> None:
     """Catches advice to lower the hips of a robot whose foot is lifted above them, or whose hips
-    are far apart."""
+    are far apart, and advice to change the robot where its gait is too wide."""
     robot = biped(Thormang(hip_half_spacing=hip_half_spacing))
     with pytest.raises(ConfigurationError, match=f"; lower {advice}$"):
         plan_walk(make_gait(3, num_steps=4, **gait), robot, PERIOD_S)

@@ -28,10 +28,8 @@ _P = ParamSpec("_P")
 _R = TypeVar("_R")
 
 _LOG = logging.getLogger(__name__)
-_COMPILED_ONCE = "once after an installation or an update: the first use takes some seconds longer"
-_COMPILED_ALWAYS = (
-    "for some seconds in every program: there is no folder to keep it that can be written"
-)
+_ONCE = "once after an installation or an update: the first use takes some seconds longer"
+_ALWAYS = "for some seconds in every program: there is no folder to keep it that can be written"
 _notes: dict[Any, str] = {}
 """How often a function is compiled, by its Python code."""
 
@@ -47,17 +45,17 @@ def compiled_part(function: Callable[_P, _R]) -> Callable[_P, _R]:
     It has no entry for Python: so all kernels compile in five sixths of the time.
     """
     kernel = _compile(function, no_cpython_wrapper=True)
-    return function if kernel is function else _Part(kernel)  # Numba may be switched off
+    return function if kernel is function else _Part(kernel)  # Numba may be off
 
 
 def _compile(function: Callable[_P, _R], **options: Any) -> Any:
     # division by zero gives infinity or nan, as in NumPy; no entry for C saves compile time
     options |= {"error_model": "numpy", "no_cfunc_wrapper": True}
-    _notes[function] = _COMPILED_ONCE
+    _notes[function] = _ONCE
     try:
         return numba.njit(cache=True, **options)(function)
     except RuntimeError:  # no folder is writable: every program compiles again
-        _notes[function] = _COMPILED_ALWAYS
+        _notes[function] = _ALWAYS
         return numba.njit(**options)(function)
 
 
@@ -100,7 +98,8 @@ def record_type(**fields: Any) -> np.dtype[Any]:
     Args:
         **fields: Shape of each field of numbers, () for a number.
     """
-    return np.dtype((np.record, [(name, np.float64, shape) for name, shape in fields.items()]))
+    parts = [(name, np.float64, shape) for name, shape in fields.items()]
+    return np.dtype((np.record, parts))
 
 
 def within_compiled(function: Callable[_P, _R]) -> Callable[_P, _R]:

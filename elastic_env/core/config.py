@@ -11,8 +11,9 @@ from pathlib import Path
 from typing import Annotated, Any, Self, TypeVar
 
 import numpy as np
+import pydantic
 import yaml
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import AfterValidator, BaseModel, Field, ValidationError
 from pydantic_core import CoreSchema
 from pydantic_core.core_schema import no_info_before_validator_function
 
@@ -74,7 +75,8 @@ def _strict_schema(schema: Any) -> Any:
         strict["strict"] = True
     if kind not in ("float", "int", "list", "tuple"):
         return strict
-    return no_info_before_validator_function(_to_whole if kind == "int" else plain_numbers, strict)
+    convert = _to_whole if kind == "int" else plain_numbers
+    return no_info_before_validator_function(convert, strict)
 
 
 def _to_whole(value: Any) -> Any:
@@ -89,7 +91,7 @@ class Model(BaseModel):
     A number is one of Python or NumPy, also in an array, but neither text nor a truth value.
     """
 
-    model_config = ConfigDict(
+    model_config = pydantic.ConfigDict(
         frozen=True,
         extra="forbid",
         allow_inf_nan=False,
@@ -101,12 +103,13 @@ class Model(BaseModel):
         try:
             super().__init__(**values)
         except ValidationError as error:
-            raise ModelError(type(self).__name__, problems_of(type(self), error, values)) from None
+            problems = problems_of(type(self), error, values)
+            raise ModelError(type(self).__name__, problems) from None
 
     def _check(self) -> None:
         """Refuse parameters that contradict each other, by a ValueError."""
 
-    @model_validator(mode="after")
+    @pydantic.model_validator(mode="after")
     def _check_together(self) -> Self:
         self._check()
         return self
@@ -118,7 +121,8 @@ class Model(BaseModel):
         for field in cls.model_fields.values():
             if field.description is not None:
                 parts = re.split(r"\n\s*\n", field.description)
-                field.description = "\n\n".join([" ".join(part.split()) for part in parts])
+                lines = [" ".join(part.split()) for part in parts]
+                field.description = "\n\n".join(lines)
 
     @classmethod
     def __get_pydantic_core_schema__(cls, source: Any, handler: Any) -> CoreSchema:
@@ -162,7 +166,7 @@ Entries = Annotated[list[_Entry], Field(min_length=1, max_length=MOST_ENTRIES)]
 """A list of a configuration that must not be empty."""
 LARGEST_SEED = 2**63 - 1
 """Seeds of episodes are 64-bit integers."""
-_BYTES_PER_CHARACTER = 4
+_UTF8_BYTES = 4
 """Most bytes of a character in UTF-8."""
 
 
@@ -232,9 +236,10 @@ def load_json(
         ConfigurationError: The file cannot be read, is not a JSON mapping, or does not fit the
             model.
     """
-    content = read_json(path, _BYTES_PER_CHARACTER * LARGEST_JSON, missing, within)
+    content = read_json(path, _UTF8_BYTES * LARGEST_JSON, missing, within)
     if not isinstance(content, dict):
-        raise ConfigurationError(f"{shorten(path)} must be a mapping, got {type(content).__name__}")
+        kind = type(content).__name__
+        raise ConfigurationError(f"{shorten(path)} must be a mapping, got {kind}")
     try:
         return model(**content)
     except ModelError as error:
@@ -253,9 +258,7 @@ def read_mapping(file: Path, empty: bool = False) -> dict[str, Any]:
         ConfigurationError: The file cannot be read, is no YAML, or holds something else.
     """
     try:
-        content = parse_yaml(
-            read_bounded(file, _BYTES_PER_CHARACTER * LARGEST_TEXT).decode("utf-8")
-        )
+        content = parse_yaml(read_bounded(file, _UTF8_BYTES * LARGEST_TEXT).decode())
     except ConfigurationError:
         raise
     except (yaml.YAMLError, UnicodeDecodeError) as error:

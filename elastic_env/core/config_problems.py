@@ -112,7 +112,7 @@ def problems_of(
         path = _path(problem["loc"], values, is_missing=problem["type"] == "missing")
         cause = problem.get("ctx", {}).get("error")
         if isinstance(cause, ModelError):  # of a model within this one
-            problems += [replace(inner, path=(*path, *inner.path)) for inner in cause.problems]
+            problems += [replace(p, path=(*path, *p.path)) for p in cause.problems]
         else:
             problems.append(_problem(model, path, problem))
     return problems
@@ -123,7 +123,8 @@ def _problem(model: type[BaseModel], path: ParameterPath, problem: Any) -> Probl
     field = model.model_fields.get(str(path[0])) if len(path) == 1 else None
     match problem["type"]:
         case "extra_forbidden":
-            return Problem(path, "unknown", choices_listed(path[-1], model.model_fields))
+            choices = choices_listed(path[-1], model.model_fields)
+            return Problem(path, "unknown", choices)
         case "missing" if isinstance(path[-1], int):  # of a list of a fixed length
             return Problem(path[:-1], "must", f"must have an entry {path[-1] + 1}, got {given}")
         case "missing":

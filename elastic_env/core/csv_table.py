@@ -119,7 +119,7 @@ def _names(file: Path, header: list[str]) -> tuple[str, ...]:
 
 
 def _numbers(file: str, where: str, names: tuple[str, ...], cells: list[str]) -> Iterator[float]:
-    """Return the finite numbers of a row."""
+    """Yield the finite numbers of a row."""
     if len(cells) != len(names):
         problem = f"{len(names)} values are needed, one a column, got {len(cells)}"
         if separator := _separator(cells):
@@ -140,7 +140,8 @@ def _numbers(file: str, where: str, names: tuple[str, ...], cells: list[str]) ->
 
 def _separator(cells: list[str]) -> str:
     """Return the name of another separator than commas; empty where there is none."""
-    return next((name for mark, name in _SEPARATORS.items() if mark in "".join(cells)), "")
+    text = "".join(cells)
+    return next((name for mark, name in _SEPARATORS.items() if mark in text), "")
 
 
 def _number(cell: str) -> float:

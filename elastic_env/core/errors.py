@@ -29,7 +29,8 @@ class ElasticError(ValueError):
     exit_code: ClassVar[int] = 2
 
     def __init__(self, *args: Any) -> None:
-        super().__init__(*[readable(arg) if isinstance(arg, str) else arg for arg in args])
+        parts = [readable(arg) if isinstance(arg, str) else arg for arg in args]
+        super().__init__(*parts)
 
 
 class SystemFailedError(ElasticError):
@@ -124,7 +125,8 @@ def unknown_name(kind: str, name: object, choices: Iterable[str]) -> Configurati
         name: The given name.
         choices: The names that exist.
     """
-    return ConfigurationError(f"unknown {kind} {quote(name)}; {choices_listed(name, choices)}")
+    listed = choices_listed(name, choices)
+    return ConfigurationError(f"unknown {kind} {quote(name)}; {listed}")
 
 
 def require_known(kind: str, names: Iterable[str], choices: Collection[str]) -> None:

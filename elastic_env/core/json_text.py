@@ -37,7 +37,8 @@ _TOO_DEEP = ValueError(f"mappings and lists must be nested at most {DEEPEST_NEST
 
 def _to_int(text: str) -> int:
     if len(text) > LONGEST_NUMBER:
-        raise ValueError(f"a number must have at most {LONGEST_NUMBER} characters, got {len(text)}")
+        needed = f"at most {LONGEST_NUMBER} characters"
+        raise ValueError(f"a number must have {needed}, got {len(text)}")
     return int(text)
 
 

@@ -79,8 +79,8 @@ class SignalGroup:
         """
         names = [f"{name}.{part}" for part in parts] if len(parts) > 1 else [name]
         signals = tuple(
-            Signal(column, unit, meaning.format(part=part), kind=kind, mirrored=mirrored)
-            for column, (part, mirrored) in zip(names, parts.items(), strict=True)
+            Signal(column, unit, meaning.format(part=part), kind=kind, mirrored=image)
+            for column, (part, image) in zip(names, parts.items(), strict=True)
         )
         return cls(name, signals, (len(signals),))
 

@@ -11,7 +11,7 @@ from elastic_env.core.errors import ConfigurationError, quote, shorten
 from elastic_env.core.files import read_bounded
 
 _LARGEST_BYTES = 100_000_000
-_REAL_TYPES = ("F32", "F64")
+_TYPES = ("F32", "F64")
 
 
 def read_tensors(path: Path) -> tuple[dict[str, npt.NDArray[Any]], bytes]:
@@ -25,12 +25,12 @@ def read_tensors(path: Path) -> tuple[dict[str, npt.NDArray[Any]], bytes]:
         content = read_bounded(path, _LARGEST_BYTES, within=path.parent)
         for name, tensor in deserialize(content):
             kind = quote(tensor["dtype"])[1:-1]
-            if kind not in _REAL_TYPES:
+            if kind not in _TYPES:
                 raise ConfigurationError(
-                    f"{path}: the tensor {quote(name)} must be of type {' or '.join(_REAL_TYPES)},"
-                    f" got {kind}"
+                    f"{path}: the tensor {quote(name)} must be of type"
+                    f" {' or '.join(_TYPES)}, got {kind}"
                 )
         return load(content), content
     except (OSError, SafetensorError) as error:
-        problem = "cannot be read: it is missing, cut short or something else"
-        raise ConfigurationError(f"{shorten(path)} {problem} ({error}); copy it again") from None
+        reason = f"cannot be read: it is missing, cut short or something else ({error})"
+        raise ConfigurationError(f"{shorten(path)} {reason}; copy it again") from None

@@ -15,6 +15,7 @@ LARGEST_TEXT = 100_000
 """Largest number of characters of a text."""
 DEEPEST_NESTING = 30
 """Largest depth of mappings and lists within one another."""
+_TOO_DEEP = f"mappings and lists must be nested at most {DEEPEST_NESTING} deep"
 MOST_VALUES = 20_000
 """Largest number of values of a text; an alias counts as all values that it repeats."""
 LONGEST_NUMBER = 40
@@ -52,13 +53,13 @@ class _Loader(Composer, yaml.CSafeLoader):
         if isinstance(event, yaml.AliasEvent):
             node = super().compose_node(parent, index)
             if id(node) not in self._sizes:
-                raise _refusal(event, f"the alias *{event.anchor} stands within what it names")
+                problem = f"the alias *{event.anchor} stands within what it names"
+                raise _refusal(event, problem)
             return node
         _require_plain(event)
         self._depth += 1
         if self._depth > DEEPEST_NESTING:
-            problem = f"mappings and lists must be nested at most {DEEPEST_NESTING} deep"
-            raise _refusal(event, problem)
+            raise _refusal(event, _TOO_DEEP)
         node = super().compose_node(parent, index)
         self._depth -= 1
         if isinstance(node, yaml.MappingNode):
@@ -66,8 +67,8 @@ class _Loader(Composer, yaml.CSafeLoader):
         size = 1 + sum(self._sizes[id(part)] for part in _parts(node))
         self._sizes[id(node)] = size
         if size > MOST_VALUES:
-            problem = f"it must hold at most {MOST_VALUES} values, aliases counted in full"
-            raise _refusal(event, problem)
+            rule = f"it must hold at most {MOST_VALUES} values, aliases counted in full"
+            raise _refusal(event, rule)
         return node
 
     def construct_number(self, node: Any) -> int | float:
@@ -98,7 +99,8 @@ def parse_yaml(text: str) -> Any:
             dates as objects, zero bytes, or a key twice.
     """
     if len(text) > LARGEST_TEXT:
-        raise yaml.YAMLError(f"it must have at most {LARGEST_TEXT} characters, got {len(text)}")
+        needed = f"at most {LARGEST_TEXT} characters"
+        raise yaml.YAMLError(f"it must have {needed}, got {len(text)}")
     loader = _Loader(text)
     try:
         return loader.get_single_data()
@@ -124,12 +126,12 @@ def _add_quotes_cure(text: str, error: yaml.MarkedYAMLError) -> yaml.MarkedYAMLE
             continue
         begin = max(mark.column - _SEARCHED, 0)
         text_around = lines[mark.line][begin : mark.column + _SEARCHED]
-        for pattern in _PATTERN.finditer(text_around):
-            if not pattern.start() <= mark.column - begin < pattern.end("key"):
+        for match in _PATTERN.finditer(text_around):
+            if not match.start() <= mark.column - begin < match.end("key"):
                 continue
-            key = pattern["key"][:40]
+            key = match["key"][:40]
             key = key if "[" in key and "]" in key else key.strip("[]")
-            value = "" if pattern["value"] is None else f": {pattern['value'].strip()[:40]}"
+            value = "" if match["value"] is None else f": {match['value'].strip()[:40]}"
             return _refusal(mark, f'put the pattern in quotes: "{key}"{value}')
     return error
 
@@ -139,7 +141,8 @@ class _Dumper(yaml.SafeDumper):
 
     def represent_text(self, text: str) -> yaml.ScalarNode:
         """Represent text, with escapes where it holds line ends or others that do not print."""
-        return self.represent_scalar(f"{_TAG}str", text, None if text.isprintable() else '"')
+        style = None if text.isprintable() else '"'
+        return self.represent_scalar(f"{_TAG}str", text, style)
 
 
 _Dumper.add_representer(str, _Dumper.represent_text)
@@ -173,7 +176,8 @@ def _require_plain(event: Any) -> None:
         tag = event.tag.replace(_TAG, "!!")[:100]
         raise _refusal(event, f"the tag {tag!r} has no meaning here; leave it out")
     if isinstance(event, yaml.ScalarEvent) and NO_TEXT.search(event.value):
-        raise _refusal(event, "text must hold neither zero bytes nor halves of characters")
+        problem = "text must hold neither zero bytes nor halves of characters"
+        raise _refusal(event, problem)
 
 
 def _require_names(loader: _Loader, node: yaml.MappingNode) -> None:
@@ -202,4 +206,5 @@ def _parts(node: yaml.Node | None) -> list[yaml.Node]:
 
 def _refusal(at: Any, problem: str) -> yaml.MarkedYAMLError:
     """Return an error at a place: a node, an event or a mark."""
-    return yaml.MarkedYAMLError(problem=problem, problem_mark=getattr(at, "start_mark", at))
+    mark = getattr(at, "start_mark", at)
+    return yaml.MarkedYAMLError(problem=problem, problem_mark=mark)

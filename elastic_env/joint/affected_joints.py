@@ -14,7 +14,8 @@ TRANSMISSIONS = {
     int(mujoco.mjtTrn.mjTRN_SLIDERCRANK): "a slider-crank",
 }
 """Names of the transmissions of actuators that are not on a joint."""
-_NO_EQUALITIES = int(mujoco.mjtDisableBit.mjDSBL_EQUALITY | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
+_FLAG = mujoco.mjtDisableBit
+_NO_EQUALITIES = int(_FLAG.mjDSBL_EQUALITY) | int(_FLAG.mjDSBL_CONSTRAINT)
 _PULLING = "stiffness stiffnesspoly damping frictionloss armature"
 """Properties by which a tendon pulls."""
 

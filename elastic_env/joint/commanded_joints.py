@@ -2,12 +2,12 @@
 
 import warnings
 from collections.abc import Collection, Iterable
+from functools import partial
 
 import mujoco
 from mujoco import MjModel
 
-from elastic_env.joint import model_joints
-from elastic_env.joint.affected_joints import active_equalities, equality_joints, joints_to_world
+from elastic_env.joint import affected_joints, model_joints
 from elastic_env.joint.supported_models import require_robot
 
 
@@ -39,11 +39,8 @@ def without_fingers(model: MjModel, joints: Iterable[str], named: Collection[str
     coupled = [name for name in coupled_fingers(model) if name not in named]
     fingers = [name for name in coupled if name in joints]
     if fingers:
-        names = model_joints.first_names(fingers)
-        warnings.warn(
-            f"{names} are coupled in the model (mimic), and are held, unlike all others",
-            stacklevel=5,
-        )
+        reason = "are coupled in the model (mimic), and are held, unlike all others"
+        warnings.warn(f"{model_joints.first_names(fingers)} {reason}", stacklevel=5)
     return [name for name in joints if name not in fingers]
 
 
@@ -56,8 +53,8 @@ def coupled_fingers(model: MjModel) -> list[str]:
     """
     groups: list[set[int]] = []
     coupled: set[int] = set()
-    for e in active_equalities(model):
-        affected, _ = equality_joints(model, e)
+    for e in affected_joints.active_equalities(model):
+        affected, _ = affected_joints.equality_joints(model, e)
         if len(affected) > 1:
             joined = [group for group in groups if group & affected]
             apart = [group for group in groups if not group & affected]
@@ -74,7 +71,8 @@ def _is_gripper(model: MjModel, group: set[int]) -> bool:
     """Return True if coupled joints are fingers: on several branches, with no joint beyond them."""
     body_of = model.jnt_bodyid.tolist()
     parent_of = model.body_parentid.tolist()
+    chain = partial(affected_joints.joints_to_world, model)
+    carried = {j for j in range(model.njnt) if chain(body_of[j]) & group}
     bodies = {body_of[j] for j in group}
-    carried = {j for j in range(model.njnt) if joints_to_world(model, body_of[j]) & group}
-    first = [body for body in bodies if not joints_to_world(model, parent_of[body]) & group]
+    first = [body for body in bodies if not chain(parent_of[body]) & group]
     return carried <= group and len(first) > 1 and len(group) < model.njnt

@@ -62,12 +62,13 @@ def require_sound(model: MjModel, name: str) -> None:
         ("stiffness", model.jnt_stiffness, model.joint),
     ):
         is_sound = np.isfinite(values) & (np.asarray(values) >= 0.0)
-        wrong = np.flatnonzero(~(is_sound.all(axis=1) if is_sound.ndim > 1 else is_sound))
+        is_row_sound = is_sound.all(axis=1) if is_sound.ndim > 1 else is_sound
+        wrong = np.flatnonzero(~is_row_sound)
         if wrong.size:
             kind = "body" if element == model.body else "joint"
             raise ConfigurationError(
-                f"{field} of {kind} {element(int(wrong[0])).name!r} of {name} must be finite and >="
-                f" 0, got {quote(np.ravel(values[wrong[0]]).tolist())}"
+                f"{field} of {kind} {element(int(wrong[0])).name!r} of {name} must be"
+                f" finite and >= 0, got {quote(np.ravel(values[wrong[0]]).tolist())}"
             )
     if not np.isfinite(model.opt.gravity).all():
         raise ConfigurationError(
@@ -116,7 +117,8 @@ def call_mujoco(action: Callable[[], _Result], name: str, verb: str) -> _Result:
         thread.start()
         thread.join()
     if errors:
-        raise ConfigurationError(f"MuJoCo cannot {verb} {name}: {_describe(errors[0])}") from None
+        problem = _describe(errors[0])
+        raise ConfigurationError(f"MuJoCo cannot {verb} {name}: {problem}") from None
     return results[0]
 
 

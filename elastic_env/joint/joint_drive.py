@@ -65,8 +65,8 @@ def _redirect_sensors(spec: MjSpec, actuator: str, joint: str, has_servo: bool) 
     sensors = [sensor for sensor in of_actuators if sensor.objname == actuator]
     if sensors and not has_servo:
         raise ConfigurationError(
-            f"sensor {sensors[0].name!r} reads the actuator {actuator!r}, which is to be replaced;"
-            f" give the joint {joint!r} a servo, or delete the sensor"
+            f"sensor {sensors[0].name!r} reads the actuator {actuator!r}, which is to"
+            f" be replaced; give the joint {joint!r} a servo, or delete the sensor"
         )
     for sensor in sensors:
         sensor.objname = servo_name(joint)

@@ -29,6 +29,11 @@ def friction_name(joint: str) -> str:
     return f"{joint}_dry_friction"
 
 
+def part_names(name: str) -> tuple[str, ...]:
+    """Names of all these parts."""
+    return motor_name(name), spring_name(name), servo_name(name), friction_name(name)
+
+
 @dataclass(frozen=True)
 class JointAddresses:
     """Indices of motor and link angles of the elastic joints in `qpos` and `qvel`, each (n,)."""

@@ -28,9 +28,9 @@ RIGID = "rigid"
 SOFTEST = 1e-9
 """Least stiffness and position gain; below it 1/K may overflow [N·m/rad]."""
 CURE = (
-    "K has no default. `elastic identify --robot MODEL --log poses.csv` identifies it from static"
-    " poses and writes a file for `joints`; `elastic identify --robot MODEL --plan 20` proposes"
-    " poses"
+    "K has no default. `elastic identify --robot MODEL --log poses.csv` identifies it"
+    " from static poses and writes a file for `joints`; `elastic identify --robot MODEL"
+    " --plan 20` proposes poses"
 )
 """Advice on how to get a stiffness, for errors."""
 
@@ -96,8 +96,8 @@ class ServoSettings(Model):
             return float("inf")
         if self.position_gain is None:
             raise ConfigurationError(
-                f"the servo of joint {joint!r} gives way under a load, as its integral_gain is 0;"
-                " give its position_gain [N·m/rad], too"
+                f"the servo of joint {joint!r} gives way under a load, as its"
+                " integral_gain is 0; give its position_gain [N·m/rad], too"
             )
         return self.position_gain
 

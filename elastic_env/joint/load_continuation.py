@@ -70,8 +70,8 @@ class LoadPath:
             if others:
                 rest = f"it can rest {' and '.join(others)}"
             return (
-                f"{question} At {100.0 * float(self.load[row][0]):.3g} % of the load K + ∂τ_g/∂q"
-                f" becomes singular: the link tips over, and {rest}"
+                f"{question} At {100.0 * float(self.load[row][0]):.3g} % of the load K"
+                f" + ∂τ_g/∂q becomes singular: the link tips over, and {rest}"
             )
         poses = " and ".join([f"at {self.q[(*row, joint)]:.4g} rad", *others])
         return f"{question} The pose is bistable: the link can rest {poses}"
@@ -176,8 +176,8 @@ class _Springs:
 
     def softest(self, q: Array, load: Array) -> IntArray:
         """Return the joint that moves most in the direction of least stiffness, (...)."""
-        matrix = self._matrix(q, load * self.compliance, np.ones_like(load, dtype=np.bool_))
-        values, vectors = np.linalg.eig(matrix)
+        every = np.ones_like(load, dtype=np.bool_)
+        values, vectors = np.linalg.eig(self._matrix(q, load * self.compliance, every))
         least = np.real(values).argmin(axis=-1)[..., None, None]
         softest = np.take_along_axis(vectors, least, axis=-1)[..., 0]
         return np.abs(softest).argmax(axis=-1)

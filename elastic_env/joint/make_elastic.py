@@ -26,7 +26,7 @@ from elastic_env.core.signals import Array
 from elastic_env.joint.compile_model import compile_spec
 from elastic_env.joint.elasticity import ElasticJoint
 from elastic_env.joint.joint_drive import BLANK, ActuatorRule, drive_joint
-from elastic_env.joint.joint_names import friction_name, motor_name, servo_name, spring_name
+from elastic_env.joint.joint_names import motor_name, part_names, spring_name
 from elastic_env.joint.keyframes import carry_keyframes
 from elastic_env.joint.model_file import read_model
 from elastic_env.joint.supported_models import require_few, require_flags, require_hinge
@@ -52,10 +52,10 @@ def make_elastic(
 ) -> MjSpec:
     """Return a copy of a specification in which the named hinges are elastic.
 
-    A hinge keeps its limits, springs, damping and friction on the link (the joint's friction is
-    added), sensors and equalities on the link angle, and actuators on the rotor. The rotor inertia
-    replaces its armature, which stands for the rotor. Keyframes get the rotors at their link
-    angles, without deflection.
+    Limits, springs, damping and friction of a hinge stay on the link. The joint's friction is
+    added. Sensors and equalities stay on the link angle, actuators move to the rotor. The rotor
+    inertia replaces the armature of the hinge. Keyframes get the rotors at their link angles,
+    without deflection.
 
     The elastic model follows its springs at the physics step of the model. The integrator becomes
     `implicitfast` where the model's own does not follow them. MuJoCo's automatic reset is off, so
@@ -68,9 +68,9 @@ def make_elastic(
     `Robot-v0` and `PositionCompensator` refuse, since these must know every torque in advance:
     floating bases and ball joints; loops and other equality constraints; tendons that pull; drives
     by a tendon, a site or a slider-crank; springs that are not linear; deformable bodies, plugins
-    and wind; and a flag that turns gravity off. `elastic_env.joint.supported_models` has their
-    checks. All three refuse models that contradict themselves, that have no hinge, or whose flags
-    turn springs, dampers, the servo or the friction of the joints off.
+    and wind; and a flag that turns gravity off. `elastic_env.joint.supported_models` has the
+    checks of both. All three refuse models that contradict themselves, that have no hinge, or whose
+    flags turn springs, dampers, the servo or the friction of the joints off.
 
     Args:
         spec: Any specification with hinges, a file of MJCF or URDF, or the text of one, see
@@ -94,7 +94,7 @@ def make_elastic(
             actuators, or friction changes with load or speed, which needs a call before every step.
     """
     are_joints = isinstance(joints, Mapping)
-    if not are_joints or not all(isinstance(joint, ElasticJoint) for joint in joints.values()):
+    if not are_joints or not all(isinstance(j, ElasticJoint) for j in joints.values()):
         needed = "a mapping from names of hinges to ElasticJoint"
         raise ConfigurationError(f"joints must be {needed}, got {quote(joints)}")
     require_few(joints)
@@ -159,14 +159,14 @@ def _choose_integrator(spec: MjSpec) -> None:
     model.opt.integrator = _IMPLICITFAST
     if not is_stable(model):
         raise ConfigurationError(
-            f"the elastic joints explode {step} with {names}; set spec.option.timestep to at most"
-            f" {round_below(largest_stable_timestep(model)):g} s before they are made elastic, or"
-            " give them more damping"
+            f"the elastic joints explode {step} with {names}; set spec.option.timestep"
+            f" to at most {round_below(largest_stable_timestep(model)):g} s before they"
+            " are made elastic, or give them more damping"
         )
     spec.option.integrator = _IMPLICITFAST
     warnings.warn(
-        f"the elastic joints explode with {integrator} {step}; the elastic model has the integrator"
-        " IMPLICITFAST, which follows them",
+        f"the elastic joints explode with {integrator} {step}; the elastic model has"
+        " the integrator IMPLICITFAST, which follows them",
         stacklevel=3,
     )
 
@@ -189,7 +189,7 @@ def _hinge(spec: MjSpec, name: str) -> MjsJoint:
     used = {part.name for part in [*spec.joints, *spec.tendons, *spec.actuators]}
     used |= {motor_name(name)} & {body.name for body in spec.bodies}
     used |= {number.name for number in spec.numerics}
-    for derived in (motor_name(name), spring_name(name), servo_name(name), friction_name(name)):
+    for derived in part_names(name):
         if derived in used:
             raise ConfigurationError(
                 f"{derived!r} already exists in the model; is the hinge {name!r} elastic already?"

@@ -11,15 +11,8 @@ from pathlib import Path
 
 from elastic_env.core.errors import ConfigurationError, quote
 from elastic_env.core.files import read_rows
-from elastic_env.joint.model_text import (
-    DEEPEST,
-    LARGEST_BYTES,
-    ModelText,
-    decode_xml,
-    name_of,
-    parse_xml,
-    read_bytes,
-)
+from elastic_env.joint import model_text
+from elastic_env.joint.model_text import ModelText, name_of
 
 MOST_JOINTS = 500
 MOST_BODIES = 2_000
@@ -101,22 +94,18 @@ class _Counts:
             self._folders += [compiler.get(key, "") for key in FOLDERS]
 
     def _count(
-        self,
-        element: ET.Element,
-        files: Files,
-        copies: float,
-        in_world: bool,
-        depth: int,
+        self, element: ET.Element, files: Files, copies: float, in_world: bool, depth: int
     ) -> None:
         tag = element.tag
-        if depth > DEEPEST:
+        if depth > model_text.DEEPEST:
             raise ConfigurationError(
-                f"{self.model.name} must be nested at most {DEEPEST} elements deep, with includes"
+                f"{self.model.name} must be nested at most {model_text.DEEPEST}"
+                " elements deep, with includes"
             )
         if tag in _SOFT:
             raise ConfigurationError(
-                f"{self.model.name} has a deformable body (<{tag}>), whose forces on the links are"
-                " not known in advance; take it out of the model"
+                f"{self.model.name} has a deformable body (<{tag}>), whose forces on"
+                " the links are not known in advance; take it out of the model"
             )
         if tag == "replicate":
             copies *= max(_number(element.get("count", "1")), 1.0)
@@ -161,7 +150,8 @@ class _Counts:
     def _attach(self, element: ET.Element, files: Files, copies: float, depth: int) -> None:
         root = self._attached.get(element.get("model", ""))
         if root is not None:
-            bodies = [body for body in root.iter("body") if body.get("name") == element.get("body")]
+            name = element.get("body")
+            bodies = [body for body in root.iter("body") if body.get("name") == name]
             for body in bodies or root.findall("worldbody"):
                 self._count(body, files, copies, in_world=True, depth=depth + 1)
 
@@ -176,8 +166,9 @@ class _Counts:
             raise ConfigurationError(
                 f"{self.model.name} includes {name_of(path)} within itself; take the circle out"
             )
-        text, _ = decode_xml(read_bytes(path, "included model"), name_of(path))
-        return parse_xml(text, name_of(path)), path
+        content = model_text.read_bytes(path, "included model")
+        text, _ = model_text.decode_xml(content, name_of(path))
+        return model_text.parse_xml(text, name_of(path)), path
 
     def _add_asset(self, name: str) -> None:
         """Count a mesh or picture, which must be a regular file of bounded size, or missing."""
@@ -192,9 +183,10 @@ class _Counts:
             if not stat.S_ISREG(status.st_mode):
                 problem = f"names {name_of(path)}, which is no regular file"
                 raise ConfigurationError(f"{self.model.name} {problem}")
-            self._limit(f"bytes of {name_of(name)}", status.st_size, LARGEST_BYTES)
+            self._limit(f"bytes of {name_of(name)}", status.st_size, model_text.LARGEST_BYTES)
             self.asset_bytes += status.st_size
-            self._limit("bytes of meshes and pictures", self.asset_bytes, MOST_ASSET_BYTES)
+            what = "bytes of meshes and pictures"
+            self._limit(what, self.asset_bytes, MOST_ASSET_BYTES)
             self.pixels += _pixels(path)
             self._limit("pixels of pictures", self.pixels, MOST_PIXELS)
 
@@ -205,7 +197,8 @@ class _Counts:
         for of_tag, names, most in _LARGEST:
             if of_tag in ("", tag) and any(name in values for name in names):
                 numbers = [n for name in names for n in _numbers(values.get(name, ""))]
-                self._limit(f"{' times '.join(names)} of <{tag}>", _product(numbers), most)
+                what = f"{' times '.join(names)} of <{tag}>"
+                self._limit(what, _product(numbers), most)
         for name, value in values.items():
             if name.startswith(_PREFIXES[:1]) or name.endswith(_PREFIXES[1:]):
                 product = _product(_numbers(value))
@@ -215,13 +208,15 @@ class _Counts:
                     f"{name} of <{tag}> in {self.model.name} must be numbers, got {quote(value)}"
                 )
         if tag == "texture" and {"width", "height"} <= set(values):
-            self.pixels += _product([*_numbers(values["width"]), *_numbers(values["height"])])
+            sizes = [*_numbers(values["width"]), *_numbers(values["height"])]
+            self.pixels += _product(sizes)
             self._limit("pixels of pictures", self.pixels, MOST_PIXELS)
         if tag == "mesh" and "params" in values:
             resolution = max(_numbers(values["params"]), default=0.0)
             self._limit("as params of a mesh", resolution, _FINEST_MESH)
         if tag == "size" and "memory" in values:
-            self._limit("memory of <size> [bytes]", _bytes(values["memory"]), _MOST_MEMORY)
+            memory = _bytes(values["memory"])
+            self._limit("memory of <size> [bytes]", memory, _MOST_MEMORY)
         if tag == "lengthrange" and "timestep" in values:
             step = _number(values["timestep"])
             if not step >= _SHORTEST_STEP_S:
@@ -233,8 +228,8 @@ class _Counts:
         """Refuse a count or size above its bound."""
         if not value <= most:
             raise ConfigurationError(
-                f"{self.model.name} must have at most {most:.15g} {what}, copies counted, it has"
-                f" {value:.15g} or more; give a smaller model"
+                f"{self.model.name} must have at most {most:.15g} {what}, copies"
+                f" counted, it has {value:.15g} or more; give a smaller model"
             )
 
 

@@ -14,15 +14,16 @@ import numpy as np
 from mujoco import MjModel, MjSpec
 
 from elastic_env.core.errors import ConfigurationError, quote
+from elastic_env.joint import urdf
 from elastic_env.joint.compile_model import call_mujoco, compile_spec, require_sound
 from elastic_env.joint.model_bounds import require_bounds
 from elastic_env.joint.model_text import ModelText, read_model_text
-from elastic_env.joint.urdf import keep_shapes, require_tree, require_unique_names, urdf_spec
 
 GivenModel = str | Path | MjSpec | MjModel
 """A file of MJCF (.xml) or URDF (.urdf), the text of one, a specification, or a compiled model."""
 
 _MESH = mujoco.mjtGeom.mjGEOM_MESH
+_FROM_GEOMS = mujoco.mjtInertiaFromGeom
 _REFERRING = "actuators equalities sensors tendons excludes pairs tuples"
 """Elements of a specification that refer to others by name."""
 
@@ -98,18 +99,18 @@ def read_model(model: GivenModel, shapes: bool = False) -> ReadModel:
 
 def _read_urdf(text: ModelText, shapes: bool) -> ReadModel:
     """Read a URDF, and check it without its shapes."""
-    require_unique_names(text)
-    require_tree(text)
+    urdf.require_unique_names(text)
+    urdf.require_tree(text)
     bare = copy.deepcopy(text.root)
-    keep_shapes(bare, None)
-    spec = urdf_spec(bare, text.name)
+    urdf.keep_shapes(bare, None)
+    spec = urdf.urdf_spec(bare, text.name)
     model = compile_spec(_whole_copy(spec, text.name), text.name)
     if not shapes:
         return ReadModel(spec, model, text.name, [])
     meshes = [mesh.get("filename", "") for mesh in text.root.iter("mesh")]
-    lost = keep_shapes(text.root, text.folder)
+    lost = urdf.keep_shapes(text.root, text.folder)
     try:
-        with_shapes = urdf_spec(text.root, text.name)
+        with_shapes = urdf.urdf_spec(text.root, text.name)
         model_with_shapes = compile_spec(with_shapes.copy(), text.name)
         return ReadModel(with_shapes, model_with_shapes, text.name, lost)
     except ConfigurationError:  # about a shape: without shapes it compiles
@@ -148,16 +149,17 @@ def _without_lost_meshes(read: Callable[[], MjSpec], name: str) -> ReadModel:
     for element in [*spec.skins, *spec.meshes, *spec.textures]:
         spec.delete(element)
     if heavy:
-        spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO
-        for body in heavy:  # any mass: other errors come before the one about the meshes
+        spec.compiler.inertiafromgeom = _FROM_GEOMS.mjINERTIAFROMGEOM_AUTO
+        # with any mass: other errors come before the one about the meshes
+        for body in heavy:
             body.mass = 1.0
             body.inertia = np.ones(3)
             body.explicitinertial = True
     model = compile_spec(_whole_copy(spec, name), name)
     if heavy:
         raise ConfigurationError(
-            f"body {heavy[0].name!r} of {name} has its mass from a mesh that cannot be read; give"
-            f" the body an <inertial>, or bring the mesh. {problem}"
+            f"body {heavy[0].name!r} of {name} has its mass from a mesh that cannot be"
+            f" read; give the body an <inertial>, or bring the mesh. {problem}"
         )
     return ReadModel(spec, model, name, lost)
 
@@ -172,14 +174,15 @@ def _whole_copy(spec: MjSpec, name: str) -> MjSpec:
     for kind in _REFERRING.split():
         if len(getattr(whole, kind)) < len(getattr(spec, kind)):
             call_mujoco(spec.compile, name, "compile")  # its error names the reference
-            raise ConfigurationError(f"one of the {kind} of {name} cannot be copied by MuJoCo")
+            problem = f"one of the {kind} of {name} cannot be copied by MuJoCo"
+            raise ConfigurationError(problem)
     return whole
 
 
 def _bodies_with_mesh_mass(spec: MjSpec) -> list[mujoco.MjsBody]:
     """Return the bodies whose mass comes from a mesh."""
-    from_geoms = spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
-    bodies = [body for body in spec.bodies[1:] if from_geoms or not body.explicitinertial]
+    from_geoms = spec.compiler.inertiafromgeom == _FROM_GEOMS.mjINERTIAFROMGEOM_TRUE
+    bodies = [b for b in spec.bodies[1:] if from_geoms or not b.explicitinertial]
     return [body for body in bodies if any(map(_uses_mesh, body.geoms))]
 
 

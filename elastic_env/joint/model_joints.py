@@ -30,8 +30,8 @@ def has_nameless_hinge(model: MjModel) -> bool:
 def nameless_hinge() -> ConfigurationError:
     """Return the error for an elastic hinge without a name."""
     return ConfigurationError(
-        "a hinge of the model has no name; give each one, the stiffness is by name, or name the"
-        " joints that are elastic: the others are held"
+        "a hinge of the model has no name; give each one, the stiffness is by name, or"
+        " name the joints that are elastic: the others are held"
     )
 
 
@@ -48,7 +48,7 @@ def held_positions(model: MjModel, joints: Sequence[str]) -> dict[int, float]:
 
 
 def mass_matrix(model: MjModel, data: mujoco.MjData) -> Array:
-    """Return the inertia of all joints with armature at the positions of a state [kg·m²]."""
+    """Return the inertia of all joints with armature in the pose of a state, (nv, nv) [kg·m²]."""
     mujoco.mj_kinematics(model, data)
     mujoco.mj_comPos(model, data)
     mujoco.mj_crb(model, data)

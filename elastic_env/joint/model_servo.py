@@ -40,9 +40,9 @@ def position_servo(model: MjModel, joint: str) -> ModelServo | None:
     actuators = _actuators(model, joint)
     if (model.actuator_gaintype[actuators] == mujoco.mjtGain.mjGAIN_DCMOTOR).any():
         raise ConfigurationError(
-            f"joint {joint!r} has a dcmotor, whose gains are not read; give position_gain, and"
-            " `motor` with torque_constant, back_emf, resistance and voltage, under `servo` of this"
-            " joint in `joints`"
+            f"joint {joint!r} has a dcmotor, whose gains are not read; give"
+            " position_gain, and `motor` with torque_constant, back_emf, resistance and"
+            " voltage, under `servo` of this joint in `joints`"
         )
     position = [i for i in actuators if model.actuator_biasprm[i, 1] != 0.0]
     if not position:
@@ -61,9 +61,9 @@ def position_servo(model: MjModel, joint: str) -> ModelServo | None:
     is_servo = len(position) == 1 and not is_filtered and is_position_law
     if not is_servo or bias[0] != 0.0 or kp <= 0.0 or kv < 0.0 or gear == 0.0:
         raise ConfigurationError(
-            f"the actuators of joint {joint!r} are no single position servo of the form kp (u - q)"
-            " - kv q_dot; give its position_gain, velocity_gain and integral_gain under `servo` of"
-            " this joint in `joints`"
+            f"the actuators of joint {joint!r} are no single position servo of the form"
+            " kp (u - q) - kv q_dot; give its position_gain, velocity_gain and"
+            " integral_gain under `servo` of this joint in `joints`"
         )
     braking = gear**2 * kv + _braking(model, joint)
     damping = float(model.dof_damping[model.joint(joint).dofadr[0]])
@@ -94,14 +94,15 @@ def force_limit(model: MjModel, joint: str) -> float | None:
     limits = [(1.0, model.jnt_actfrclimited[number], model.jnt_actfrcrange[number])]
     for i in _actuators(model, joint):
         gear = abs(float(model.actuator_gear[i, 0]))
-        limits.append((gear, model.actuator_forcelimited[i], model.actuator_forcerange[i]))
+        force = (model.actuator_forcelimited[i], model.actuator_forcerange[i])
+        limits.append((gear, *force))
         is_fixed = model.actuator_gaintype[i] == mujoco.mjtGain.mjGAIN_FIXED
         is_unbiased = model.actuator_biastype[i] == mujoco.mjtBias.mjBIAS_NONE
         if is_fixed and is_unbiased and model.actuator_dyntype[i] == 0:
             gain = gear * abs(float(model.actuator_gainprm[i, 0]))
-            at = model.actuator_ctrladr[i]  # earlier actuators may have several commands
+            at = model.actuator_ctrladr[i]  # others may have several commands
             limits.append((gain, model.actuator_ctrllimited[at], model.actuator_ctrlrange[at]))
-    torques = [_smaller_end(joint, *limit) for limit in limits]
+    torques = [_limit(joint, *limit) for limit in limits]
     return min((torque for torque in torques if torque is not None), default=None)
 
 
@@ -113,7 +114,7 @@ def _actuators(model: MjModel, joint: str) -> list[int]:
 
 
 def _braking(model: MjModel, joint: str) -> float:
-    """Return the damping by a joint's actuators, except its position servo [N·m·s/rad]."""
+    """Return the damping by actuators at zero command, without the position servo [N·m·s/rad]."""
     braking = 0.0
     for i in _actuators(model, joint):
         damping = float(model.actuator_damping[i])
@@ -124,7 +125,7 @@ def _braking(model: MjModel, joint: str) -> float:
     return braking
 
 
-def _smaller_end(joint: str, scale: float, is_limited: bool, interval: Array) -> float | None:
+def _limit(joint: str, scale: float, is_limited: bool, interval: Array) -> float | None:
     """Return the smaller end of an interval about zero, scaled [N·m]; None if it is no limit.
 
     Raises:
@@ -135,8 +136,8 @@ def _smaller_end(joint: str, scale: float, is_limited: bool, interval: Array) ->
     lowest, highest = map(float, interval)
     if not lowest < 0.0 < highest:
         raise ConfigurationError(
-            f"a force range of joint {joint!r} is {lowest:g} to {highest:g}, and a servo has to"
-            " push both ways; give its torque_limit [N·m] under `servo` of this joint in `joints`,"
-            " or mend the range"
+            f"a force range of joint {joint!r} is {lowest:g} to {highest:g}, and a"
+            " servo has to push both ways; give its torque_limit [N·m] under `servo` of"
+            " this joint in `joints`, or mend the range"
         )
     return scale * min(-lowest, highest)

@@ -28,14 +28,14 @@ _KINDS = ("mujoco", "robot")
 _FILE = "give a file of MJCF (.xml) or URDF (.urdf)"
 _DECLARED = re.compile(rb"""^\s*<\?xml[^>]{0,200}?encoding\s*=\s*["']([A-Za-z0-9._-]{1,40})["']""")
 _DECLARATION = re.compile(r"^<\?xml[^>]*\?>")
-_BYTE_ORDER_MARKS = (
+_MARKS = (
     (codecs.BOM_UTF8, "utf-8-sig"),
     (codecs.BOM_UTF32_LE, "utf-32"),
     (codecs.BOM_UTF32_BE, "utf-32"),
     (codecs.BOM_UTF16_LE, "utf-16"),
     (codecs.BOM_UTF16_BE, "utf-16"),
 )
-_NO_FILE_ENCODINGS = "idna punycode unicode_escape raw_unicode_escape undefined mbcs oem"
+_NO_ENCODINGS = "idna punycode unicode_escape raw_unicode_escape undefined mbcs oem"
 _XACRO = "xacro"
 _EXPAND = "expand it first: xacro arm.urdf.xacro > arm.urdf"
 _XACRO_PARTS = {"property", "macro", "include", "insert_block", "if", "unless", "arg"}
@@ -52,7 +52,7 @@ class ModelText:
         name: Its name in errors.
         folder: Folder of the files that it names.
         file: Its file; None for a text.
-        text: The text, without byte order mark and decoded.
+        text: The decoded text, without byte order mark.
         is_utf8: True if the file is in UTF-8, which MuJoCo reads by itself.
     """
 
@@ -144,8 +144,9 @@ def parse_xml(text: str, name: str) -> ET.Element:
         nonlocal depth
         depth += 1
         if depth > DEEPEST:
-            problem = f"{name} must be nested at most {DEEPEST} elements deep"
-            raise ConfigurationError(f"{problem}; line {parser.CurrentLineNumber} is deeper")
+            needed = f"must be nested at most {DEEPEST} elements deep"
+            line = f"line {parser.CurrentLineNumber} is deeper"
+            raise ConfigurationError(f"{name} {needed}; {line}")
         tree.start(tag, attributes)
 
     def end(tag: str) -> None:
@@ -173,7 +174,7 @@ def parse_xml(text: str, name: str) -> ET.Element:
 
 def decode_xml(content: bytes, name: str) -> tuple[str, bool]:
     """Decode a file by its byte order mark or declared encoding; True if that is UTF-8."""
-    encoding = next((name for mark, name in _BYTE_ORDER_MARKS if content.startswith(mark)), None)
+    encoding = next((name for mark, name in _MARKS if content.startswith(mark)), None)
     if encoding is None:
         declared = _DECLARED.match(content)
         encoding = declared.group(1).decode("ascii") if declared else "utf-8"
@@ -181,10 +182,8 @@ def decode_xml(content: bytes, name: str) -> tuple[str, bool]:
             encoding = "utf-16-le" if content[0] else "utf-16-be"
     try:
         codec = codecs.lookup(encoding)
-        if (
-            not codec._is_text_encoding
-            or codec.name.replace("-", "_") in _NO_FILE_ENCODINGS.split()
-        ):  # type: ignore[attr-defined]
+        is_for_text = codec._is_text_encoding  # type: ignore[attr-defined]
+        if not is_for_text or codec.name.replace("-", "_") in _NO_ENCODINGS.split():
             raise LookupError
         text = content.decode(encoding)
     except LookupError:
@@ -221,11 +220,10 @@ def _require_model(model: ModelText) -> None:
     if model.is_urdf:
         for element in _robot_parts(root):
             values = element.attrib.values()
-            placeholders = [value for value in values if _PLACEHOLDER.search(value)]
-            if placeholders:
-                raise ConfigurationError(
-                    f"{name} has {quote(placeholders[0])} in <{element.tag}>, of xacro; {_EXPAND}"
-                )
+            first = next((text for text in values if _PLACEHOLDER.search(text)), None)
+            if first is not None:
+                problem = f"{name} has {quote(first)} in <{element.tag}>, of xacro"
+                raise ConfigurationError(f"{problem}; {_EXPAND}")
         old = next((part.tag for part in root if part.tag in _XACRO_PARTS), None)
         if old is not None:
             problem = f"{name} is a file of xacro, it has <{old}>"

@@ -69,11 +69,12 @@ class SmallServo:
     per_gain: float
     gain: float
 
-    def joint(self, gain: float | None = None, voltage: float | None = None) -> ElasticJoint:
+    def joint(self, gain: float | None, voltage: float | None) -> ElasticJoint:
         """Return the elastic joint with this servo; arguments as in `small_servo`."""
         motor = self.motor if voltage is None else self.motor.replace(voltage=voltage)
         torque_per_duty = motor.torque_constant * motor.voltage / motor.resistance
-        position_gain = torque_per_duty * self.per_gain * (self.gain if gain is None else gain)
+        gain = self.gain if gain is None else gain
+        position_gain = torque_per_duty * self.per_gain * gain
         stiffness = _STIFFNESS_PER_GAIN * position_gain
         swing = float(np.sqrt(stiffness * self.rotor_inertia))
         return ElasticJoint(
@@ -94,14 +95,13 @@ class SmallServo:
 
 
 def _read_servo(row: dict[str, str]) -> SmallServo:
-    figures = {column: float(value) for column, value in row.items() if column != "name"}
+    figures = {key: float(value) for key, value in row.items() if key != "name"}
     motor = Motor(**{name: figures.pop(name) for name in Motor.model_fields})
     return SmallServo(motor, **figures)
 
 
-SMALL_SERVOS = {
-    row["name"]: _read_servo(row) for row in read_rows(Path(__file__).with_suffix(".csv"))
-}
+_ROWS = read_rows(Path(__file__).with_suffix(".csv"))
+SMALL_SERVOS = {row["name"]: _read_servo(row) for row in _ROWS}
 """Small servos by name."""
 
 

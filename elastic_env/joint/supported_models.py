@@ -42,9 +42,9 @@ def require_robot(model: MjModel) -> None:
     for j in range(model.njnt):
         if model.jnt_type[j] not in (_HINGE, _SLIDE):
             raise ConfigurationError(
-                f"joint {model.joint(j).name!r} is free or a ball joint; a fixed base, hinges and"
-                " slides are needed: the torque of a floating robot depends on its contacts."
-                " Without compensation elastic_env.make_elastic takes it"
+                f"joint {model.joint(j).name!r} is free or a ball joint; a fixed base,"
+                " hinges and slides are needed: the torque of a floating robot depends on"
+                " its contacts. Without compensation elastic_env.make_elastic takes it"
             )
     require_hinge(model)
 
@@ -122,24 +122,25 @@ def require_known_torque(model: MjModel, joints: Sequence[str]) -> None:
         affected = affected_joints.tendon_joints(model, t) & ids
         if affected and affected_joints.tendon_pulls(model, t):
             raise ConfigurationError(
-                f"the model's tendon {model.tendon(t).name!r} has stiffness, damping, friction or"
-                " inertia; the torque of tendons with stiffness is not compensated; take it out of"
-                f" the model{_hold_cure(model, affected, ids)}"
+                f"the model's tendon {model.tendon(t).name!r} has stiffness, damping,"
+                " friction or inertia; the torque of tendons with stiffness is not"
+                f" compensated; take it out of the model{_hold_cure(model, affected, ids)}"
             )
     for a in range(model.nactuator):
         if affected := affected_joints.remote_actuator_joints(model, a) & ids:
-            names = model_joints.first_names([model.joint(j).name for j in sorted(affected)])
-            transmission = affected_joints.TRANSMISSIONS[int(model.actuator_trntype[a])]
+            names = [model.joint(j).name for j in sorted(affected)]
+            means = affected_joints.TRANSMISSIONS[int(model.actuator_trntype[a])]
             raise ConfigurationError(
-                f"the model's actuator {model.actuator(a).name!r} drives {names} by"
-                f" {transmission}, which is not compensated; drive each joint by an actuator of its"
-                f" own, or take this one out of the model{_hold_cure(model, affected, ids)}"
+                f"the model's actuator {model.actuator(a).name!r} drives"
+                f" {model_joints.first_names(names)} by {means}, which is not"
+                " compensated; drive each joint by an actuator of its own, or take this"
+                f" one out of the model{_hold_cure(model, affected, ids)}"
             )
     for j in np.flatnonzero(model.jnt_stiffnesspoly.any(axis=-1)):
         if int(j) in ids:
             raise ConfigurationError(
-                f"joint {model.joint(int(j)).name!r} has a spring whose torque is not linear, which"
-                " is not compensated; give it one number"
+                f"joint {model.joint(int(j)).name!r} has a spring whose torque is not"
+                " linear, which is not compensated; give it one number"
             )
     _require_inertia(model, joints)
 

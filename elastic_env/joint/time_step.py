@@ -98,9 +98,9 @@ def require_stable(model: mujoco.MjModel, control_period_s: float) -> None:
     stable = stable_timestep(model, control_period_s)
     if stable < model.opt.timestep:
         raise ConfigurationError(
-            "the joints are too stiff, or their links or rotors too light, for timestep_s ="
-            f" {model.opt.timestep:g} s: the simulation would explode; the largest stable one is"
-            f" timestep_s = {stable:.12g} s"
+            "the joints are too stiff, or their links or rotors too light, for"
+            f" timestep_s = {model.opt.timestep:g} s: the simulation would explode; the"
+            f" largest stable one is timestep_s = {stable:.12g} s"
         )
 
 
@@ -122,7 +122,8 @@ def _without_constraints(model: mujoco.MjModel) -> mujoco.MjModel:
     linear.opt.disableflags |= int(np.bitwise_or.reduce(_LEFT_OUT))
     linear.dof_frictionloss[:] = 0.0
     linear.tendon_frictionloss[:] = 0.0
-    linear.tendon_lengthspring[:] = linear.tendon_lengthspring.mean(axis=1, keepdims=True)
+    middle = linear.tendon_lengthspring.mean(axis=1, keepdims=True)
+    linear.tendon_lengthspring[:] = middle
     return linear
 
 

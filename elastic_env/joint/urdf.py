@@ -31,8 +31,8 @@ def require_unique_names(text: ModelText) -> None:
         twice = [name for name, count in names.items() if count > 1 and name]
         if twice:
             raise ConfigurationError(
-                f"{text.name} has the {kind} {quote(twice[0])} {names[twice[0]]} times; give each"
-                f" {kind} its own name"
+                f"{text.name} has the {kind} {quote(twice[0])} {names[twice[0]]} times;"
+                f" give each {kind} its own name"
             )
 
 
@@ -46,8 +46,8 @@ def require_tree(text: ModelText) -> None:
     parents: dict[str, str] = {}
     for joint in text.root.findall("joint"):
         name = quote(joint.get("name", ""))
-        elements = [joint.find(end) for end in _ENDS]
-        ends = ["" if element is None else element.get("link", "") for element in elements]
+        parts = [joint.find(end) for end in _ENDS]
+        ends = ["" if part is None else part.get("link", "") for part in parts]
         for end, link in zip(_ENDS, ends, strict=True):
             if link not in links:
                 needed = f"joint {name} of {text.name} needs a {end} that is a link of it"
@@ -82,7 +82,7 @@ def keep_shapes(robot: ET.Element, folder: Path | None) -> list[str]:
     """
     lost: list[str] = []
     for link in robot.iter("link"):
-        shapes, missing = ([], []) if folder is None else _drawable_shapes(link, folder)
+        shapes, missing = ([], []) if folder is None else _drawn_shapes(link, folder)
         lost += missing
         for shape in [part for part in link if part.tag in _SHAPES]:
             link.remove(shape)
@@ -121,7 +121,7 @@ def urdf_spec(robot: ET.Element, name: str) -> MjSpec:
     return spec
 
 
-def _drawable_shapes(link: ET.Element, folder: Path) -> tuple[list[ET.Element], list[str]]:
+def _drawn_shapes(link: ET.Element, folder: Path) -> tuple[list[ET.Element], list[str]]:
     """Return the shapes of a link that MuJoCo can draw, or else the meshes that it cannot read."""
     missing: list[str] = []
     for tag in _SHAPES:

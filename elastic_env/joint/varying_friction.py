@@ -65,7 +65,8 @@ class VaryingFriction:
         at = JointAddresses.of(model, self.joints)
         self.links = at.q_dot
         numerics = [model.numeric(friction_name(name)).id for name in self.joints]
-        self.numbers = model.numeric_adr[numerics].astype(np.int64) + np.arange(_TERMS)[:, None]
+        first = model.numeric_adr[numerics].astype(np.int64)
+        self.numbers = first + np.arange(_TERMS)[:, None]
         has_spring = at.theta != at.q
         self._elastic = np.flatnonzero(has_spring)
         self._rigid = np.flatnonzero(~has_spring)

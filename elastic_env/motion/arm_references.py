@@ -16,29 +16,22 @@ from elastic_env.core.config import LARGEST_SEED, Locator, quantity
 from elastic_env.core.csv_table import read_table
 from elastic_env.core.errors import ConfigurationError, quote, require_known
 from elastic_env.core.signals import Array, BoolArray, IntArray
-from elastic_env.motion import references
+from elastic_env.motion import references, trajectory
 from elastic_env.motion.inverse_kinematics import joint_path
 from elastic_env.motion.references import AnyReference, RepeatableReference
-from elastic_env.motion.trajectory import (
-    LONGEST_S,
-    STAND_S,
-    Motion,
-    Plan,
-    control_times,
-    quintic,
-)
+from elastic_env.motion.trajectory import STAND_S, Plan, control_times, quintic
 from elastic_env.rigid.tree.end_effector import EndEffector
 
 _TRIES = 1000
-_LEAST_PERIOD_S = 1e-6
+_SHORTEST_S = 1e-6
 _LARGEST_RAD = 1e4
 _MOST_ROWS = 2_000_000
 _HALF_TURN = np.pi / 2
 _MARGIN = 0.1
 """Share of a joint's range that drawn poses keep from either end."""
-_SEARCH_ROUNDS = 200
-_SEARCH_POSES = 64
-_SEARCH_STRIDE = 0.05
+_ROUNDS = 200
+_NEARBY = 64
+_STRIDE = 0.05
 """Search for a pose that servos hold: rounds, poses drawn in each, and their distance as a share of
 the range.
 """
@@ -100,12 +93,12 @@ class Workspace:
         """Find a pose at or near home that the servos hold, (n,) [rad]; None if none is found."""
         generator = np.random.default_rng(0)
         low, high = self.pose_bounds()
-        stride = _SEARCH_STRIDE * np.maximum(high - low, 0.0)
+        stride = _STRIDE * np.maximum(high - low, 0.0)
         pose = self.home
-        for _ in range(_SEARCH_ROUNDS):
+        for _ in range(_ROUNDS):
             if self.lack(pose) == 0.0:
                 return self._move_home(pose)
-            drawn = pose + stride * generator.standard_normal((_SEARCH_POSES, len(pose)))
+            drawn = pose + stride * generator.standard_normal((_NEARBY, len(pose)))
             nearby = np.vstack([pose, np.clip(drawn, low, high)])
             pose = nearby[self.lack(nearby).argmin()]
         return None
@@ -165,7 +158,8 @@ class Poses(_RandomPoses):
         since = t - STAND_S - period * number
         settled = self.move_s + self.settle_s
         is_at_rest = (since > settled + 1e-9) & (since <= period + 1e-9)
-        return Plan(*self._motion(visits, t, period), is_at_rest, np.where(is_at_rest, number, -1))
+        rest = np.where(is_at_rest, number, -1)
+        return Plan(*self._motion(visits, t, period), is_at_rest, rest)
 
 
 class Moves(_RandomPoses):
@@ -195,8 +189,8 @@ class _Path(RepeatableReference):
         tool = workspace.end_effector
         if tool is None:
             raise ConfigurationError(
-                f"the reference {getattr(self, 'kind', '')!r} moves an end effector; name one,"
-                " end_effector=SITE"
+                f"the reference {getattr(self, 'kind', '')!r} moves an end effector;"
+                " name one, end_effector=SITE"
             )
         path = joint_path(tool, workspace.home, place, float(s.max()))
         q = path(s)
@@ -284,7 +278,8 @@ class Csv(RepeatableReference):
 
     def joint_plan(self, workspace: Workspace, period_s: float) -> Plan:
         """A plan of all joints, (T, n)."""
-        from scipy.interpolate import CubicSpline  # imported late: it takes long, and few need it
+        # imported late: it takes long, and few need it
+        from scipy.interpolate import CubicSpline
 
         names, rows = _read_angles(Path(self.file), workspace.joints)
         times = rows[:, 0] - rows[0, 0]
@@ -295,7 +290,8 @@ class Csv(RepeatableReference):
         since = np.clip(t - STAND_S, 0.0, times[-1])
         moving = ((t > STAND_S) & (t < STAND_S + times[-1]))[:, None]
         q_dot = np.where(moving, path(since, 1), 0.0)
-        return _moving_plan(t, path(since), q_dot, np.where(moving, path(since, 2), 0.0))
+        q_ddot = np.where(moving, path(since, 2), 0.0)
+        return _moving_plan(t, path(since), q_dot, q_ddot)
 
 
 OfArm: TypeAlias = Poses | Moves | Line | Circle | Csv
@@ -308,9 +304,9 @@ make_arm_reference = partial(
 """Make a reference of a robot of several joints; arguments as in `make_reference`."""
 
 
-def motion_of(reference: AnyArmReference, workspace: Workspace) -> Motion:
+def motion_of(reference: AnyArmReference, workspace: Workspace) -> trajectory.Motion:
     """Return the motion of all joints of a robot by a reference."""
-    return Motion(partial(_plan, reference, workspace), reference.is_random)
+    return trajectory.Motion(partial(_plan, reference, workspace), reference.is_random)
 
 
 def _plan(
@@ -347,13 +343,14 @@ def _read_angles(file: Path, joints: tuple[str, ...]) -> tuple[list[str], Array]
         raise ConfigurationError(
             f"{file} must have two rows or more, and a column of angles or more beside time_s"
         )
-    if (np.diff(t) <= 0.0).any() or t[-1] - t[0] > LONGEST_S:
+    if (np.diff(t) <= 0.0).any() or t[-1] - t[0] > trajectory.LONGEST_S:
         raise ConfigurationError(
-            f"time_s of {file} must increase from row to row, over at most {LONGEST_S:g} s"
+            f"time_s of {file} must increase from row to row, over at most"
+            f" {trajectory.LONGEST_S:g} s"
         )
-    if np.diff(t).min() < _LEAST_PERIOD_S or np.abs(rows[:, 1:]).max() > _LARGEST_RAD:
+    if np.diff(t).min() < _SHORTEST_S or np.abs(rows[:, 1:]).max() > _LARGEST_RAD:
         raise ConfigurationError(
-            f"{file} must have rows at least {_LEAST_PERIOD_S:g} s apart, and angles within"
+            f"{file} must have rows at least {_SHORTEST_S:g} s apart, and angles within"
             f" ±{_LARGEST_RAD:g} rad"
         )
     return list(names[1:]), rows

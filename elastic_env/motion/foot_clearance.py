@@ -31,8 +31,8 @@ def require_clear_feet(feet: Footholds, sole_half_size: tuple[float, float]) -> 
     if gap[step].min() <= 0.0:
         half_length, half_width = sole_half_size
         raise ConfigurationError(
-            f"the soles of {2 * half_length:g} m x {2 * half_width:g} m touch or cross in step"
-            f" {step + 1}; take a larger step_width_m or a smaller turn_rad"
+            f"the soles of {2 * half_length:g} m x {2 * half_width:g} m touch or cross"
+            f" in step {step + 1}; take a larger step_width_m or a smaller turn_rad"
         )
 
 
@@ -55,7 +55,7 @@ def sole_gap(positions: Array, yaw: Array, half_size: tuple[float, float]) -> Ar
     corners = half * np.array([[1.0, 1.0], [1.0, -1.0]])
     relative_yaw = (yaw[..., 0] - yaw[..., 1])[..., None]
     # extent of the other sole along the sides of a sole
-    other_extent = np.abs(turn(corners, relative_yaw)).max(axis=-2)
-    gaps = [np.abs(turn(offset, -yaw[..., foot])) - half - other_extent for foot in range(2)]
+    extent = np.abs(turn(corners, relative_yaw)).max(axis=-2)
+    gaps = [np.abs(turn(offset, -yaw[..., foot])) - half - extent for foot in range(2)]
     aside = turn(offset, -yaw.mean(axis=-1))[..., 1]
     return np.minimum(np.concatenate(gaps, axis=-1).max(axis=-1), aside)

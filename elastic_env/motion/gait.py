@@ -71,7 +71,8 @@ class Gait(Model):
     @property
     def step_period_s(self) -> float:
         """Duration of a step [s]."""
-        return self.double_support_s + self.single_support_s + self.last_double_support_s
+        swing_s = self.double_support_s + self.single_support_s
+        return swing_s + self.last_double_support_s
 
     @property
     def duration_s(self) -> float:
@@ -92,8 +93,8 @@ class Gait(Model):
         shortest = min(self.double_support_s, self.last_double_support_s)
         if self.transfer == "ramp" and shortest < _RAMP_SHIFT_S:
             raise ValueError(
-                f"the transfer 'ramp' shifts the ZMP in {_RAMP_SHIFT_S} s; a double support of"
-                f" {shortest} s is shorter"
+                f"the transfer 'ramp' shifts the ZMP in {_RAMP_SHIFT_S} s; a double"
+                f" support of {shortest} s is shorter"
             )
 
 
@@ -164,9 +165,9 @@ def step_timing(gait: Gait, control_period_s: float) -> Timing:
     period = first + single + last
     if gait.duration_s > LONGEST_WALK_S:
         raise ConfigurationError(
-            f"a walk must last at most {LONGEST_WALK_S:g} s with standing, {gait.num_steps} steps"
-            f" of {gait.step_period_s:g} s last {gait.duration_s:g} s; take fewer steps or shorter"
-            " ones"
+            f"a walk must last at most {LONGEST_WALK_S:g} s with standing,"
+            f" {gait.num_steps} steps of {gait.step_period_s:g} s last"
+            f" {gait.duration_s:g} s; take fewer steps or shorter ones"
         )
     time = control_times(gait.duration_s, control_period_s)
     begin = round(STAND_S / control_period_s)
@@ -264,7 +265,8 @@ def zmp_reference(gait: Gait, timing: Timing, feet: Footholds) -> Array:
     zmp = np.repeat(feet.positions[:1].mean(axis=1), len(timing.time), axis=0)
     for begin, duration, start, target in _shifts(gait, feet):
         progress = (timing.time - begin) / duration
-        blend = minimum_jerk(progress) if gait.transfer == "smooth" else np.clip(progress, 0.0, 1.0)
+        is_smooth = gait.transfer == "smooth"
+        blend = minimum_jerk(progress) if is_smooth else np.clip(progress, 0.0, 1.0)
         zmp += blend[:, None] * (target - start)
     return zmp
 
@@ -312,8 +314,8 @@ def _whole_steps(name: str, duration_s: float, control_period_s: float) -> int:
         counts = {max(int(steps), 1), max(int(np.ceil(steps)), 1)}
         nearest = [f"{count * control_period_s:.10g} s" for count in sorted(counts)]
         raise ConfigurationError(
-            f"{name} must be a multiple of the control period of {control_period_s} s, got"
-            f" {duration_s} s; the nearest {'is' if len(nearest) == 1 else 'are'}"
+            f"{name} must be a multiple of the control period of {control_period_s} s,"
+            f" got {duration_s} s; the nearest {'is' if len(nearest) == 1 else 'are'}"
             f" {' and '.join(nearest)}"
         )
     return round(steps)

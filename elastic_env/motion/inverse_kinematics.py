@@ -40,18 +40,18 @@ def joint_path(tool: EndEffector, home: Array, place: Callable[[Array], Array], 
     start, R = tool.pose(home)
     angles = [home]
     for at, offset in zip(s[1:], place(s[1:]), strict=True):
-        q = _solve_pose(tool, angles[-1], start + offset, R)
+        q = _solve(tool, angles[-1], start + offset, R)
         if q is None or np.abs(q - angles[-1]).max() > _LARGEST_JUMP_RAD:
             raise ConfigurationError(
-                f"the end effector cannot follow the path beyond {100 * at / end:.0f} % of it,"
-                f" {offset.round(3).tolist()} m from its start: out of reach, or a singular"
-                " posture; choose a smaller path or another home"
+                f"the end effector cannot follow the path beyond {100 * at / end:.0f} %"
+                f" of it, {offset.round(3).tolist()} m from its start: out of reach, or"
+                " a singular posture; choose a smaller path or another home"
             )
         angles.append(q)
     return CubicSpline(s, np.array(angles))
 
 
-def _solve_pose(tool: EndEffector, q: Array, place: Array, R_ref: Array) -> Array | None:
+def _solve(tool: EndEffector, q: Array, place: Array, R_ref: Array) -> Array | None:
     """Find angles near q that reach a place, or None; six joints or more keep the orientation."""
     from scipy.spatial.transform import Rotation
 
@@ -60,11 +60,13 @@ def _solve_pose(tool: EndEffector, q: Array, place: Array, R_ref: Array) -> Arra
         position, R = tool.pose(q)
         error = place - position
         if keeps_orientation:
-            error = np.concatenate([error, Rotation.from_matrix(R_ref @ R.T).as_rotvec()])
+            turn = Rotation.from_matrix(R_ref @ R.T).as_rotvec()
+            error = np.concatenate([error, turn])
         if np.abs(error).max() < _TOLERANCE:
             return q
-        J_position, J_rotation = tool.jacobian(q)
-        J = np.concatenate([J_position, J_rotation]) if keeps_orientation else J_position
+        J, J_rotation = tool.jacobian(q)
+        if keeps_orientation:
+            J = np.concatenate([J, J_rotation])
         step: Array = J.T @ np.linalg.solve(J @ J.T + _DAMPING * np.eye(len(J)), error)
         q = q + step
     return None

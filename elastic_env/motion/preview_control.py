@@ -106,8 +106,8 @@ def follow_zmp(config: PreviewConfig, zmp_ref: Array, start: Array) -> ComMotion
     steps, dimensions = zmp_ref.shape
     reach = len(gains.preview)
     continuation = np.repeat(zmp_ref[-1:], reach + 1, axis=0)
-    # steps_ahead[k] = r_{k+1} − r_k
-    steps_ahead = np.diff(np.concatenate([zmp_ref, continuation]), axis=0)
+    # increments[k] = r_{k+1} − r_k
+    increments = np.diff(np.concatenate([zmp_ref, continuation]), axis=0)
     state = np.zeros((3, dimensions))
     state[0] = start
     last = state
@@ -121,7 +121,7 @@ def follow_zmp(config: PreviewConfig, zmp_ref: Array, start: Array) -> ComMotion
             jerk
             - gains.integral * error
             - gains.state @ (state - last)
-            - gains.preview @ steps_ahead[k : k + reach]
+            - gains.preview @ increments[k : k + reach]
         )
         last = state
         state = A @ state + b[:, None] * jerk

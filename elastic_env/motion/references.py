@@ -16,16 +16,8 @@ from typing_extensions import override
 from elastic_env.core.config import LARGEST_SEED, Model, quantity
 from elastic_env.core.errors import ConfigurationError, unknown_name
 from elastic_env.core.signals import Array, IntArray
-from elastic_env.motion.trajectory import (
-    QUINTIC_PEAK_ACCELERATION,
-    QUINTIC_PEAK_RATE,
-    STAND_S,
-    Extent,
-    Plan,
-    control_times,
-    quintic,
-    quintic_moves,
-)
+from elastic_env.motion import trajectory
+from elastic_env.motion.trajectory import STAND_S, Extent, Plan, quintic
 
 _LONGEST_SUM_S = 36_000.0
 
@@ -65,7 +57,7 @@ class _JointReference(RepeatableReference):
         if self.is_random:
             plans[1:] = [self.plan(generator, period_s) for _ in plans[1:]]
         motions = [(plan.q, plan.q_dot, plan.q_ddot) for plan in plans]
-        q, q_dot, q_ddot = (np.stack(part, axis=-1) for part in zip(*motions, strict=True))
+        q, q_dot, q_ddot = np.stack(motions, axis=-1)
         return Plan(q + home, q_dot, q_ddot, first.scored, first.rest)
 
 
@@ -128,13 +120,13 @@ class Hold(_JointReference):
         return Extent(
             float(angles[0]) - self.overrun,
             float(angles[-1]) + self.overrun,
-            q_dot=QUINTIC_PEAK_RATE * float((distances / durations).max()),
-            q_ddot=QUINTIC_PEAK_ACCELERATION * float((distances / durations**2).max()),
+            q_dot=trajectory.QUINTIC_PEAK_RATE * float((distances / durations).max()),
+            q_ddot=trajectory.QUINTIC_PEAK_ACCELERATION * float((distances / durations**2).max()),
         )
 
     def _move_s(self, distance: float) -> float:
         """Return the duration of a move over a distance [rad]."""
-        return max(QUINTIC_PEAK_RATE * distance / self.rate, self.shortest_move_s)
+        return max(trajectory.QUINTIC_PEAK_RATE * distance / self.rate, self.shortest_move_s)
 
     @override
     def plan(self, generator: Generator, control_period_s: float) -> Plan:
@@ -152,8 +144,8 @@ class Hold(_JointReference):
                 begin = time + self.settle_s
                 time = begin + self.measure_s
                 windows.append((begin, time))
-        t = control_times(time, control_period_s)
-        q, q_dot, q_ddot = quintic_moves(t, start, moves)
+        t = trajectory.control_times(time, control_period_s)
+        q, q_dot, q_ddot = trajectory.quintic_moves(t, start, moves)
         rest = np.full(len(t), -1)
         for visit, (begin, end) in enumerate(windows):
             rest[(t > begin) & (t <= end + 1e-9)] = visit
@@ -179,8 +171,7 @@ class _Oscillation(_JointReference):
         q_dot = w_dot * x + w * x_dot
         q_ddot = w_ddot * x + 2.0 * w_dot * x_dot + w * x_ddot
         q = self.middle + w * x
-        scored = t > STAND_S + self.onset_s
-        return Plan(q, q_dot, q_ddot, scored, np.full(len(t), -1))
+        return Plan(q, q_dot, q_ddot, t > STAND_S + self.onset_s, np.full(len(t), -1))
 
     def _extent(self, rate: float, acceleration: float) -> Extent:
         """Return bounds with the envelope, for any phase of the oscillation during its growth."""
@@ -194,7 +185,8 @@ class _Oscillation(_JointReference):
         return Extent(*ends, float(q_dot.max()), float(q_ddot.max()))
 
     def _time_base(self, control_period_s: float) -> Array:
-        return control_times(STAND_S + self.onset_s + self.duration_s, control_period_s)
+        end_s = STAND_S + self.onset_s + self.duration_s
+        return trajectory.control_times(end_s, control_period_s)
 
 
 class Sine(_Oscillation):
@@ -249,7 +241,8 @@ class Multisine(_Oscillation):
 
     @property
     def _omega(self) -> Array:
-        return 2.0 * np.pi * np.linspace(self.lowest_hz, self.highest_hz, self.components)
+        hertz = np.linspace(self.lowest_hz, self.highest_hz, self.components)
+        return 2.0 * np.pi * hertz
 
     @override
     def extent(self) -> Extent:
@@ -259,7 +252,8 @@ class Multisine(_Oscillation):
 
     @override
     def plan(self, generator: Generator, control_period_s: float) -> Plan:
-        phases = self.choose_generator(generator).uniform(0.0, 2.0 * np.pi, self.components)
+        generator = self.choose_generator(generator)
+        phases = generator.uniform(0.0, 2.0 * np.pi, self.components)
         t = self._time_base(control_period_s)
         omega = self._omega
         share = self.amplitude / self.components
@@ -291,8 +285,8 @@ class Steps(_JointReference):
     def extent(self) -> Extent:
         span = 2.0 * self.amplitude
         ends = (self.middle - self.amplitude, self.middle + self.amplitude)
-        q_ddot = QUINTIC_PEAK_ACCELERATION * span / self.move_s**2
-        return Extent(*ends, QUINTIC_PEAK_RATE * span / self.move_s, q_ddot)
+        q_ddot = trajectory.QUINTIC_PEAK_ACCELERATION * span / self.move_s**2
+        return Extent(*ends, trajectory.QUINTIC_PEAK_RATE * span / self.move_s, q_ddot)
 
     @override
     def plan(self, generator: Generator, control_period_s: float) -> Plan:
@@ -303,8 +297,8 @@ class Steps(_JointReference):
             (STAND_S + i * period, self.move_s, float(self.middle + x))
             for i, x in enumerate(offsets)
         ]
-        t = control_times(STAND_S + self.moves * period, control_period_s)
-        q, q_dot, q_ddot = quintic_moves(t, self.middle, moves)
+        t = trajectory.control_times(STAND_S + self.moves * period, control_period_s)
+        q, q_dot, q_ddot = trajectory.quintic_moves(t, self.middle, moves)
         return Plan(q, q_dot, q_ddot, scored=t > STAND_S, rest=np.full(len(t), -1))
 
 

@@ -58,17 +58,19 @@ def sway_frequencies(
     hessian = (V[0] - V[1] - V[2] + V[3]) / (4.0 * _STEP**2)
     change = angles_at(unit) - angles_at(-unit)
     motion = np.vstack([np.eye(_DOF), change.T / (2.0 * _STEP)])
-    mass = motion.T @ FloatingBody(biped.rigid, biped.joint_names).mass_matrix(q) @ motion
+    body = FloatingBody(biped.rigid, biped.joint_names)
+    mass = motion.T @ body.mass_matrix(q) @ motion
     eigenvalues = linalg.eigh(hessian, mass, eigvals_only=True)
     return np.sqrt(np.where(eigenvalues > 0.0, eigenvalues, np.nan))
 
 
 def _rotations(x: Array) -> Array:
-    return legs.rotation_z(x[:, 5]) @ legs.rotation_y(x[:, 4]) @ legs.rotation_x(x[:, 3])
+    tilted = legs.rotation_z(x[:, 5]) @ legs.rotation_y(x[:, 4])
+    return tilted @ legs.rotation_x(x[:, 3])
 
 
 def _angles(biped: Biped, pelvis: Array, ankles: Array, x: Array) -> Array:
-    """Return joint angles that keep both soles on the ground, from pelvis motions (n, 6)."""
+    """Return angles with both soles on the ground, from pelvis motions (n, 6) to (n, 12)."""
     R = _rotations(x)
     relative = (ankles - (pelvis + x[:, :3])[:, None]) @ R - biped.hips
     feet_R = np.broadcast_to(R.swapaxes(-1, -2)[:, None], (len(x), 2, 3, 3))

@@ -100,8 +100,8 @@ def control_times(duration_s: float, control_period_s: float) -> Array:
     """
     if duration_s > STAND_S + LONGEST_S:
         raise ConfigurationError(
-            f"a motion must last at most {LONGEST_S:g} s, got {duration_s - STAND_S:.6g} s; take"
-            " fewer or quicker moves"
+            f"a motion must last at most {LONGEST_S:g} s, got"
+            f" {duration_s - STAND_S:.6g} s; take fewer or quicker moves"
         )
     return np.arange(round(duration_s / control_period_s) + 1) * control_period_s
 
@@ -157,8 +157,8 @@ class PlanTable:
         self.num_steps = probe.num_steps
         if not probe.scored.any():
             raise ConfigurationError(
-                "the reference has no scored control step: its scored time is below the control"
-                f" period of {period_s} s; lengthen it"
+                "the reference has no scored control step: its scored time is below the"
+                f" control period of {period_s} s; lengthen it"
             )
         plans = num_worlds if motion.is_random else 1
         rows = _motion_rows(probe)
@@ -177,7 +177,8 @@ class PlanTable:
     def draw(self, world: int, generator: np.random.Generator) -> None:
         """Draw a new plan for one world."""
         if self._motion.is_random:
-            self.motion[world] = _motion_rows(self._motion.plan(generator, self._period))
+            plan = self._motion.plan(generator, self._period)
+            self.motion[world] = _motion_rows(plan)
 
 
 def _motion_rows(plan: Plan) -> Array:

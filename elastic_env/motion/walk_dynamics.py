@@ -68,8 +68,7 @@ def walk_torque(biped: Biped, feet: Feet, q: Array, dynamics: WalkDynamics, shar
     forces = weights[..., None] * dynamics.force[:, None]
     moments = np.zeros_like(forces)
     moments[..., 2] = weights * dynamics.moment[:, None]
-    arms = points - feet.ankles
-    moments += np.cross(arms, forces)
+    moments += np.cross(points - feet.ankles, forces)
     wrench = (turn(forces, -feet.yaw), turn(moments, -feet.yaw))
     contact = biped.chains.loads(len(q), wrench=wrench)
     return dynamics.torque + biped.chains.torque(contact, q)

@@ -126,8 +126,7 @@ class WalkPlan:
         origin = np.pad(self.origin, ((0, 0), (0, 1)))
         ankles = turn(self.ankles - origin[:, None], -self.heading[:, None])
         com = turn(self.com - origin[:, :2], -self.heading)
-        rows = np.arange(len(com))
-        lever = com - ankles[rows, self.timing.support, :2]
+        lever = com - ankles[np.arange(len(com)), self.timing.support, :2]
         across = np.stack([-lever[:, 1], lever[:, 0]], axis=-1)
         turning = self.heading_dot[:, None] * across
         return LocalPlan(
@@ -166,7 +165,7 @@ def plan_walk(gait: Gait, biped: Biped, control_period_s: float) -> WalkPlan:
     motion = follow_zmp(preview, zmp, zmp[0])
     start = turn(np.tile(standing, (len(zmp), 1)), feet.heading)
     start[:, :2] += feet.ankles[..., :2].mean(axis=1)
-    pelvis = _pelvis_under(motion.com, start, biped, feet, timing.time)
+    pelvis = _find_pelvis(motion.com, start, biped, feet, timing.time)
     q = _joint_angles(biped, pelvis, feet, timing.time)
     dynamics = walk_dynamics(biped, pelvis, feet.heading, q, control_period_s)
     q_dot, q_ddot = derivatives(q, control_period_s)
@@ -219,7 +218,7 @@ def refine_plan(plan: WalkPlan, biped: Biped, control_period_s: float) -> WalkPl
     from_pelvis = turn(biped.chains.center_of_mass(plan.q), plan.heading)
     com = (plan.pelvis + from_pelvis)[:, :2] + correction.com
     feet = Feet(plan.ankles, plan.foot_yaw, plan.heading)
-    pelvis = _pelvis_under(com, plan.pelvis, biped, feet, plan.timing.time)
+    pelvis = _find_pelvis(com, plan.pelvis, biped, feet, plan.timing.time)
     q = _joint_angles(biped, pelvis, feet, plan.timing.time)
     q_dot, q_ddot = derivatives(q, control_period_s)
     refined = replace(
@@ -289,13 +288,13 @@ def _standing_pelvis(gait: Gait, biped: Biped, zmp: Array, feet: Feet) -> tuple[
     """Return the pelvis over the ZMP at rest, and the height of the center of mass."""
     start = np.array([[*zmp, gait.hip_height_m]])
     begin = np.zeros(1)
-    pelvis = _pelvis_under(zmp[None], start, biped, feet, begin)
+    pelvis = _find_pelvis(zmp[None], start, biped, feet, begin)
     q = _joint_angles(biped, pelvis, feet, begin)
     com = pelvis + turn(biped.chains.center_of_mass(q), feet.heading)
     return pelvis[0], float(com[0, 2])
 
 
-def _pelvis_under(com: Array, start: Array, biped: Biped, feet: Feet, t: Array) -> Array:
+def _find_pelvis(com: Array, start: Array, biped: Biped, feet: Feet, t: Array) -> Array:
     """Find the pelvis of one height that brings the center of mass to its reference."""
     pelvis = np.array(start)
     error = np.full(1, np.inf)
@@ -322,17 +321,17 @@ def _joint_angles(biped: Biped, pelvis: Array, feet: Feet, time: Array) -> Array
 
 def _reach_error(biped: Biped, pelvis: Array, feet: Feet, time: Array) -> ConfigurationError:
     """Return the error for the foot that is farthest out of reach, and parameters to lower."""
-    from_pelvis = turn(feet.ankles - pelvis[:, None], -feet.heading[:, None])
-    from_hip = from_pelvis - biped.hips
+    from_hip = turn(feet.ankles - pelvis[:, None], -feet.heading[:, None]) - biped.hips
     reach = biped.leg.reach
     distance = np.linalg.norm(from_hip, axis=-1)
     row, leg = np.unravel_index(int(np.argmax(distance)), distance.shape)
     x, y, z = from_hip[row, leg]
     vertical = "lift_m" if z > 0.0 else "hip_height_m"
+    is_wide = np.ptp(feet.ankles[0, :, 1]) > np.ptp(biped.hips[:, 1])
     # distance without the part of each parameter: below the reach, the parameter can cure it
     other_parts = {
         vertical: np.hypot(x, y),
-        "hip_half_spacing": np.hypot(x, z),
+        "step_width_m" if is_wide else "hip_half_spacing": np.hypot(x, z),
         "step_length_m": np.hypot(y, z),
     }
     cures = [name for name, rest in other_parts.items() if rest < reach]
@@ -340,6 +339,6 @@ def _reach_error(biped: Biped, pelvis: Array, feet: Feet, time: Array) -> Config
     decimals = max(4, -int(np.floor(np.log10(excess))))
     return ConfigurationError(
         f"the {('left', 'right')[leg]} foot is out of reach at {time[row]:.3f} s:"
-        f" {distance[row, leg]:.{decimals}f} m from the hip to the ankle, at most {reach:g} m;"
-        f" lower {' or '.join(cures or [vertical])}"
+        f" {distance[row, leg]:.{decimals}f} m from the hip to the ankle, at most"
+        f" {reach:g} m; lower {' or '.join(cures or [vertical])}"
     )

@@ -8,7 +8,7 @@ import numpy as np
 _RADIUS = 0.02
 """Radius of a rod divided by the size of the robot."""
 _RGBA = (0.75, 0.76, 0.78, 1.0)
-_APPEARANCE: dict[str, Any] = {"rgba": _RGBA, "mass": 0.0, "contype": 0, "conaffinity": 0}
+_LOOK: dict[str, Any] = {"rgba": _RGBA, "mass": 0.0, "contype": 0, "conaffinity": 0}
 _CAPSULE = mujoco.mjtGeom.mjGEOM_CAPSULE
 _SPHERE = mujoco.mjtGeom.mjGEOM_SPHERE
 
@@ -34,4 +34,4 @@ def add_simple_bodies(spec: mujoco.MjSpec) -> None:
 
 
 def _add(body: Any, kind: mujoco.mjtGeom, radius: float, **place: Any) -> None:
-    body.add_geom(type=kind, size=[radius, 0.0, 0.0], **_APPEARANCE, **place)
+    body.add_geom(type=kind, size=[radius, 0.0, 0.0], **_LOOK, **place)

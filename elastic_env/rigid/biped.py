@@ -97,10 +97,10 @@ class Biped:
             ElasticError: A foot is out of reach.
         """
         heading = np.asarray(heading)[..., None]
-        hip_yaw = heading - foot_yaw
+        relative_yaw = heading - foot_yaw
         target = turn(ankles - pelvis[..., None, :], -heading) - self.hips
         level = np.broadcast_to(np.eye(3), (*target.shape, 3))
         # the hip's first axis is vertical: solve for a parallel sole, then turn the whole leg
-        q = leg_angles(self.leg, turn(target, hip_yaw), level)
-        q[..., 0] -= hip_yaw
+        q = leg_angles(self.leg, turn(target, relative_yaw), level)
+        q[..., 0] -= relative_yaw
         return q.reshape(*pelvis.shape[:-1], 2 * len(JOINTS))

@@ -39,6 +39,5 @@ def shares(share_right: Array) -> Array:
 
 def contact_points(zmp: Array, share_right: Array, feet: Array) -> Array:
     """Return the points at which the forces of the feet act, (..., 2, 2) [m]; see `load_share`."""
-    weights = shares(share_right)
-    offset = zmp - (weights[..., None] * feet).sum(axis=-2)
+    offset = zmp - (shares(share_right)[..., None] * feet).sum(axis=-2)
     return feet + offset[..., None, :]

@@ -31,8 +31,8 @@ class FloatingBody:
         free_ids = np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)
         free = [model.joint(int(j)).name for j in free_ids]
         if len(free) != 1:
-            problem = f"a floating robot needs one free joint, this model has {len(free)}"
-            raise ConfigurationError(problem)
+            got = f"this model has {len(free)}"
+            raise ConfigurationError(f"a floating robot needs one free joint, {got}")
         require_hinge_tree(model, joints, but=free)
         self._model = pinocchio_model(model)
         self._data = self._model.createData()
@@ -41,7 +41,8 @@ class FloatingBody:
         self._base_q = base.idx_q
         self._base_v = base.idx_v
         self._q = np.array([joint.idx_q for joint in names])
-        self._zero = model.qpos0[[int(model.joint(joint).qposadr[0]) for joint in joints]]
+        addresses = [int(model.joint(joint).qposadr[0]) for joint in joints]
+        self._zero = model.qpos0[addresses]
         self._v = np.array([joint.idx_v for joint in names])
 
     def inverse_dynamics(
@@ -77,7 +78,8 @@ class FloatingBody:
             change[base + 1] -= velocity[3] * velocity[0]
             change[base + 5] = base_ddot[i, 3]
             change[self._v] = q_ddot[i]
-            effort = pinocchio.rnea(self._model, self._data, self._position(q[i]), rate, change)
+            position = self._position(q[i])
+            effort = pinocchio.rnea(self._model, self._data, position, rate, change)
             wrench[i] = effort[base : base + 6]
             torque[i] = effort[self._v]
         return wrench, torque
@@ -93,14 +95,14 @@ class FloatingBody:
         """Inertia of base translation, base rotation, hinges: (n,) [rad] to (6 + n, 6 + n) [SI]."""
         rows = np.concatenate([np.arange(self._base_v, self._base_v + 6), self._v])
         full = pinocchio.crba(self._model, self._data, self._position(q))
-        upper = np.triu(full)
-        return (upper + np.triu(full, 1).T)[np.ix_(rows, rows)]
+        return (np.triu(full) + np.triu(full, 1).T)[np.ix_(rows, rows)]
 
     def center_of_mass(self, q: Array) -> Array:
         """Center of mass of the robot in the frame of the base, (N, n) [rad] to (N, 3) [m]."""
         com = np.empty((len(q), 3))
         for i in range(len(q)):
-            com[i] = pinocchio.centerOfMass(self._model, self._data, self._position(q[i]))
+            position = self._position(q[i])
+            com[i] = pinocchio.centerOfMass(self._model, self._data, position)
         return com
 
 
@@ -118,7 +120,8 @@ def pinocchio_model(model: mujoco.MjModel) -> pinocchio.Model:
             name = model.joint(int(j)).name
             if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_FREE:
                 T = pinocchio.SE3.Identity()
-                carrier = tree.addJoint(carrier, pinocchio.JointModelFreeFlyer(), T, name)
+                free = pinocchio.JointModelFreeFlyer()
+                carrier = tree.addJoint(carrier, free, T, name)
                 continue
             T_body_anchor = pinocchio.SE3(np.eye(3), model.jnt_pos[j].copy())
             revolute = pinocchio.JointModelRevoluteUnaligned(model.jnt_axis[j].copy())

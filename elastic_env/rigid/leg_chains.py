@@ -37,15 +37,13 @@ class LegChains:
     """
 
     def __init__(
-        self,
-        model: mujoco.MjModel,
-        legs: Sequence[Sequence[str]],
-        weightless: Sequence[int] = (),
+        self, model: mujoco.MjModel, legs: Sequence[Sequence[str]], weightless: Sequence[int] = ()
     ) -> None:
         model_copy = copy.copy(model)
         model_copy.body_mass[list(weightless)] = 0.0
         pelvis = int(model.body_parentid[model.joint(legs[0][0]).bodyid[0]])
-        tree = Tree.of(model_copy, [name for leg in legs for name in leg], {}, root=pelvis)
+        joints = [name for leg in legs for name in leg]
+        tree = Tree.of(model_copy, joints, {}, root=pelvis)
         for number, leg in enumerate(legs):
             foot = int(model.joint(leg[-1]).bodyid[0])
             link = tree.links[tree.carrier[foot]]
@@ -171,7 +169,8 @@ class LegTorque(NamedTuple):
         if not kernels.solve_legs(links, self.loads, _dense(q), stiffness, right, x):
             torque = self.gravity_torque(q) if torque is None else torque
             # raises the error of a singular matrix
-            solve_stiffness(np.broadcast_to(stiffness, q.shape), self.gravity_gradient(q), torque)
+            K = np.broadcast_to(stiffness, q.shape)
+            solve_stiffness(K, self.gravity_gradient(q), torque)
         return x
 
 

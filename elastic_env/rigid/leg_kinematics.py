@@ -138,7 +138,7 @@ def _require_reach(leg: LegGeometry, distance: Array) -> None:
     if outside.size:
         worst = int(outside[0])
         raise ElasticError(
-            f"foot target {worst} is {distance.ravel()[worst]:.4f} m from the hip, out of reach of"
-            f" a leg of {leg.thigh} m + {leg.shank} m ({nearest:.4f} to {leg.reach:.4f} m); lower"
-            " the hip or shorten the step"
+            f"foot target {worst} is {distance.ravel()[worst]:.4f} m from the hip, out"
+            f" of reach of a leg of {leg.thigh} m + {leg.shank} m ({nearest:.4f} to"
+            f" {leg.reach:.4f} m); lower the hip or shorten the step"
         )

@@ -32,20 +32,20 @@ def torque_shortage(robot: RobotModel, body: RigidBody, q: Array) -> Array:
         Sum over the joints, (...).
     """
     limits = robot.largest_torque(np.zeros_like(q))
-    needed = robot.largest_servo_torque(body.gravity_torque(q))
+    needed = robot.needed_torque(body.gravity_torque(q))
     return np.maximum(needed / limits - _USABLE_SHARE, 0.0).sum(axis=-1)
 
 
 def home_error(robot: RobotModel, body: RigidBody, home: Array) -> ConfigurationError:
     """Error for servos that do not hold the robot at its home."""
     limits = robot.largest_torque(np.zeros_like(home))
-    needed = robot.largest_servo_torque(body.gravity_torque(home))
+    needed = robot.needed_torque(body.gravity_torque(home))
     weakest = int((needed / limits).argmax())
     return arm_references.WeakServosError(
         f"at home the weight takes {needed[weakest]:.4g} N·m of the servo of joint"
-        f" {robot.joint_names[weakest]!r}, which is limited to {limits[weakest]:.4g} N·m, and no"
-        " pose near home was found that is held with a fifth to spare: a simulated robot would"
-        " sink; raise its torque_limit, or choose another home"
+        f" {robot.joint_names[weakest]!r}, which is limited to {limits[weakest]:.4g}"
+        " N·m, and no pose near home was found that is held with a fifth to spare: a"
+        " simulated robot would sink; raise its torque_limit, or choose another home"
     )
 
 
@@ -70,12 +70,12 @@ def plan_motion(
 def _require_range(config: JointConfig, robot: RobotModel, q: Array) -> None:
     """Refuse a reference that presses a joint against its limit."""
     ranges = joint_ranges(robot.rigid, robot.joint_names)
-    for name, lowest, highest, angle in zip(robot.joint_names, *ranges, q.T, strict=True):
-        if angle.min() < lowest or angle.max() > highest:
+    for name, low, high, angle in zip(robot.joint_names, *ranges, q.T, strict=True):
+        if angle.min() < low or angle.max() > high:
             raise ConfigurationError(
                 f"the reference {config.reference.kind!r} moves joint {name!r} from"
-                f" {angle.min():.3f} to {angle.max():.3f} rad, and its range is {lowest:.3f} to"
-                f" {highest:.3f} rad; lower the amplitude, or choose another home"
+                f" {angle.min():.3f} to {angle.max():.3f} rad, and its range is"
+                f" {low:.3f} to {high:.3f} rad; lower the amplitude, or choose another home"
             )
 
 
@@ -97,14 +97,15 @@ def _require_torque(
         joint_config.require_torque(config.reference, needed, limits)
     elif np.any(needed > limits):
         weakest = np.unravel_index(np.argmax(needed - limits), needed.shape)
-        needed_at_rest, limits_at_rest = robot.demand(body.gravity_torque(q), np.zeros_like(q))
+        weight = body.gravity_torque(q)
+        needed_at_rest, limits_at_rest = robot.demand(weight, np.zeros_like(q))
         cure = "make its moves slower"
         if np.any((needed_at_rest > limits_at_rest)[:, weakest[-1]]):
             cure = "the weight alone is too much: raise its torque_limit, or choose other poses"
         raise arm_references.WeakServosError(
-            f"the reference {config.reference.kind!r} can need {needed[weakest]:.4g} N·m of the"
-            f" servo of joint {robot.joint_names[weakest[-1]]!r}, which is limited to"
-            f" {limits[weakest]:.4g} N·m; {cure}"
+            f"the reference {config.reference.kind!r} can need {needed[weakest]:.4g}"
+            f" N·m of the servo of joint {robot.joint_names[weakest[-1]]!r}, which is"
+            f" limited to {limits[weakest]:.4g} N·m; {cure}"
         )
 
 
@@ -126,8 +127,8 @@ def warn_of_near_poses(
     if near.within_rad < type(near)().within_rad:
         changes.append(f"poses are drawn within {near.within_rad:.3g} rad of home")
     warnings.warn(
-        f"the servos are too weak for the usual {near.kind!r}; {' and '.join(changes)}. To choose"
-        " them, give within_rad, move_s or home",
+        f"the servos are too weak for the usual {near.kind!r}; {' and '.join(changes)}."
+        " To choose them, give within_rad, move_s or home",
         stacklevel=4,
     )
 
@@ -148,9 +149,9 @@ def warn_of_action_bound(config: JointConfig, assumed: RobotModel, torque: Array
     if needed[worst] > bound:
         warnings.warn(
             f"the weight along the reference {config.reference.kind!r} bends joint"
-            f" {assumed.joint_names[worst]!r} by up to {needed[worst]:.3g} rad, and actions are cut"
-            f" at ±{bound:g} rad: no policy can take all of it back. Spring and servo together"
-            f" need {most[worst] / bound:.3g} N·m/rad and have {stiffness[worst]:.3g}; give them"
-            " more, raise action_bound_rad, or choose poses with less load",
+            f" {assumed.joint_names[worst]!r} by up to {needed[worst]:.3g} rad, and actions are"
+            f" cut at ±{bound:g} rad: no policy can take all of it back. Spring and servo"
+            f" together need {most[worst] / bound:.3g} N·m/rad and have {stiffness[worst]:.3g};"
+            " give them more, raise action_bound_rad, or choose poses with less load",
             stacklevel=4,
         )

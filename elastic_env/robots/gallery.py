@@ -32,7 +32,7 @@ TIMESTEP_S = 1e-3
 SAG_RAD = 0.015
 """Assumed deflection of a joint under the largest torque of its robot's weight [rad]."""
 _PACKAGE = "example-robot-data"
-_ROBOTS_FOLDER = "cmeel.prefix/share/example-robot-data/robots"
+_ROBOTS = "cmeel.prefix/share/example-robot-data/robots"
 _LEAST_TORQUE_SHARE = 0.05
 """Least torque that the stiffness of a joint is designed for, over the largest torque [1]."""
 _LEAST_FREQUENCY_RAD_S = 2.0 * np.pi * 5.0
@@ -48,7 +48,7 @@ _POSES = 50
 """Number of random poses."""
 _RANGE_SHARE = 0.8
 """Share of a joint's range in random poses [1]."""
-_LARGEST_ANGLE_RAD = np.pi
+_LARGEST_RAD = np.pi
 """Largest angle in random poses [rad]."""
 
 
@@ -93,11 +93,12 @@ def gallery_file(name: str, folder: Path | None = None) -> Path:
         return assets / file.name
     robot = f"the robot {name!r}"
     try:
-        path = (folder or Path(str(distribution(_PACKAGE).locate_file(_ROBOTS_FOLDER)))) / file
+        path = (folder or Path(str(distribution(_PACKAGE).locate_file(_ROBOTS)))) / file
     except PackageNotFoundError:
         raise missing_extra(_PACKAGE, "robots", robot) from None
     if not path.is_file():
-        raise missing_extra(_PACKAGE, "robots", f"{robot}, which has no model at {path},")
+        robot = f"{robot}, which has no model at {path},"
+        raise missing_extra(_PACKAGE, "robots", robot)
     return path
 
 
@@ -144,9 +145,9 @@ def random_poses(model: MjModel, generator: np.random.Generator, number: int = _
     """
     ids = [int(model.joint(name).id) for name in hinges_of(model)]
     limited = model.jnt_limited[ids, None].astype(bool)
-    ranges = np.where(limited, model.jnt_range[ids], [-_LARGEST_ANGLE_RAD, _LARGEST_ANGLE_RAD])
+    ranges = np.where(limited, model.jnt_range[ids], [-_LARGEST_RAD, _LARGEST_RAD])
     # a range beyond half a turn, such as Kinova's 47° to 313°, is cut off there
-    ends = np.clip(ranges, -_LARGEST_ANGLE_RAD, _LARGEST_ANGLE_RAD)
+    ends = np.clip(ranges, -_LARGEST_RAD, _LARGEST_RAD)
     middle = ends.mean(axis=1)
     half = _RANGE_SHARE * np.ptp(ends, axis=1) / 2.0
     return generator.uniform(middle - half, middle + half, (number, len(ids)))

@@ -33,14 +33,15 @@ from elastic_env.rendering.side_by_side import DisplayRobot, Sides
 from elastic_env.rigid.rigid_body import RigidBody
 from elastic_env.rigid.tree.end_effector import EndEffector
 from elastic_env.robots import feasible_reference
+from elastic_env.world import robot_model
 from elastic_env.world.further_sensors import ACCELEROMETER, add_accelerometer
-from elastic_env.world.joint_config import FRICTION_FIELDS, JointConfig, RewardWeights
+from elastic_env.world.joint_config import FRICTIONS, JointConfig, RewardWeights
 from elastic_env.world.joint_signals import ACTION_BOUND_RAD
 from elastic_env.world.joint_task import JointPlant, JointTask
-from elastic_env.world.robot_model import RobotModel, joint_ranges, read_stiffness, with_stiffness
+from elastic_env.world.robot_model import RobotModel, joint_ranges
 from elastic_env.world.scenario import Scenario, make_scenario
 
-_REFERENCE_PREFIX = "elastic_env_reference_"
+_REFERENCE = "elastic_env_reference_"
 """Prefix of the names of the robot that shows the reference."""
 _MOST_HALVINGS = 12
 """Halvings of the extent of poses, to find poses that the servos can follow."""
@@ -129,7 +130,8 @@ class JointRobot:
         """
         joints = dict(self.joints)
         if stiffness is not None:
-            joints = with_stiffness(joints, read_stiffness(stiffness))
+            value = robot_model.read_stiffness(stiffness)
+            joints = robot_model.with_stiffness(joints, value)
         return JointRobotConfig(
             robot=self,
             reference=arm_references.make_arm_reference(reference),
@@ -208,7 +210,8 @@ class JointRobot:
                 feasible_reference.plan_motion(changed, true, body, workspace)
             except arm_references.WeakServosError:
                 continue
-            feasible_reference.warn_of_near_poses(true.joint_names, near, config.robot.home, home)
+            before = config.robot.home
+            feasible_reference.warn_of_near_poses(true.joint_names, near, before, home)
             return changed
         raise weak_servos
 
@@ -237,7 +240,8 @@ class JointRobot:
         Raises:
             ConfigurationError: A sensor has no place.
         """
-        spec = transform_hinges(self._spec_with_load(config), config.true_joints, config.form)
+        spec = self._spec_with_load(config)
+        spec = transform_hinges(spec, config.true_joints, config.form)
         spec.option.timestep = config.timestep_s
         spec.option.integrator = mujoco.mjtIntegrator.mjINT_RK4
         # a NaN must end the episode; MuJoCo must not restart the world by itself
@@ -282,8 +286,8 @@ class JointRobotConfig(JointConfig):
         """Joints as a compensator knows them: without friction where the scenario has none."""
         if self.scenario.friction_scale > 0.0:
             return self.joints
-        no_friction = dict.fromkeys(FRICTION_FIELDS, 0.0)
-        return {name: joint.replace(**no_friction) for name, joint in self.joints.items()}
+        none = dict.fromkeys(FRICTIONS, 0.0)
+        return {name: joint.replace(**none) for name, joint in self.joints.items()}
 
     def plant(self) -> JointPlant:
         """Make the plant, with the true and the assumed robot."""
@@ -313,7 +317,7 @@ class JointPicture(deviation_picture.DeviationPicture):
         reference = robot.rigid()
         for geom in reference.geoms:
             geom.rgba = deviation_picture.REFERENCE_RGBA
-        spec.attach(reference, prefix=_REFERENCE_PREFIX, frame=spec.worldbody.add_frame())
+        spec.attach(reference, prefix=_REFERENCE, frame=spec.worldbody.add_frame())
         legend = [("translucent: reference", deviation_picture.REFERENCE_WORD_RGBA)]
         super().__init__(spec, legend)
         self._robot = robot
@@ -336,7 +340,7 @@ class JointPicture(deviation_picture.DeviationPicture):
         enlarged = deviation_picture.enlarge_deviation(joints["q"], q_ref)
         for name, angle, reference in zip(self._joints, enlarged, q_ref, strict=True):
             self._data.joint(name).qpos = angle
-            self._data.joint(_REFERENCE_PREFIX + name).qpos = reference
+            self._data.joint(_REFERENCE + name).qpos = reference
 
 
 def _scale_mass(spec: MjSpec, body: int, scale: float) -> None:

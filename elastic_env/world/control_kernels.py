@@ -197,7 +197,8 @@ def sense_joints(
             for i in range(n):
                 joint = step.joints[world, i]
                 joint.measured.last_encoder = joint.measured.encoder
-                read_joint(qpos[world], qvel[world], step.addresses[i], joint, rules.count_rad)
+                address = step.addresses[i]
+                read_joint(qpos[world], qvel[world], address, joint, rules.count_rad)
         observe_joints(step, world, control.periods, control.observation[world])
 
 
@@ -282,13 +283,7 @@ def begin_links(qpos: Array, qvel: Array, step: Any, links: Any, worlds: BoolArr
 
 @compiled
 def sense_links(
-    qpos: Array,
-    qvel: Array,
-    step: Any,
-    links: Any,
-    control: Any,
-    first: int,
-    stride: int,
+    qpos: Array, qvel: Array, step: Any, links: Any, control: Any, first: int, stride: int
 ) -> bool:
     """Process links on a fixed base after the physics: read, measure, end, score, observe.
 
@@ -445,13 +440,15 @@ def sense_walk(physics: Any, step: Any, walker: Any, control: Any, first: int, s
             update_foot_drift(truth, planned)
             noise = next_noise(step, world)
             advance_imu(walker.inertial, walker, step, world, noise)
-            measure_walk(walker.inertial, walker, step, world, noise, planned.imu_is_due)
+            is_due = planned.imu_is_due
+            measure_walk(walker.inertial, walker, step, world, noise, is_due)
         watch_swing_foot(truth, planned, rules.loaded_n)
         ends = control.ends[:, world]
         is_last = truth.step >= len(walker.plan) - 1
-        is_over = end_episode(truth, rules, diverged[world], is_last, ends) or is_over
+        is_over = end_walk(truth, rules, diverged[world], is_last, ends) or is_over
         scores = step.worlds[world].scores
-        control.reward[world] = score_walk(truth, planned, rules.weights, ends[2], scores)
+        weights = rules.weights
+        control.reward[world] = score_walk(truth, planned, weights, ends[2], scores)
         observe_walk(step, walker, world, control.observation[world])
     return is_over
 
@@ -469,7 +466,8 @@ def observe_all_walkers(step: Any, walker: Any, observation: Array) -> None:
 def observe_walk(step: Step, walker: Walker, world: int, observation: Array) -> None:
     """Fill the columns of an observation that are not the joints'."""
     is_delayed = step.rules[step.kind[world]].is_delayed
-    measured = step.last_worlds[world].measured if is_delayed else step.worlds[world].measured
+    visible = step.last_worlds if is_delayed else step.worlds
+    measured = visible[world].measured
     coming = plan_row(walker.plan, step.worlds[world].truth.step + 1)
     columns = walker.columns[0]
     observation[columns.load_share] = coming.share
@@ -495,7 +493,7 @@ def plan_row(plan: Any, step: int) -> Any:
 
 
 @compiled_part
-def end_episode(row: Any, rules: Any, diverged: bool, is_last: bool, ends: BoolArray) -> bool:
+def end_walk(row: Any, rules: Any, diverged: bool, is_last: bool, ends: BoolArray) -> bool:
     """Fill the ends of a world, see `Control`; a world that diverged has not fallen.
 
     Returns:
@@ -655,7 +653,7 @@ def update_foot_drift(row: Any, planned: Any) -> None:
 
 
 @compiled_part
-def compute_foot_drift(force: Array, ankle: Array, planned: Array, drift: Array) -> None:
+def compute_foot_drift(force: Array, ankle: Array, plan: Array, drift: Array) -> None:
     r"""Compute the displacement of standing feet against the plan: into `drift`, (2,) [m].
 
     .. math:: d = \sum_i w_i \, (p_i - p_{i, plan}), \quad w_i = F_{z, i} / \sum_j F_{z, j}
@@ -670,7 +668,7 @@ def compute_foot_drift(force: Array, ankle: Array, planned: Array, drift: Array)
     for i in range(2):
         total = 0.0 if carried > 0.0 else np.nan
         for foot in range(len(force)):
-            total += force[foot] / carried * (ankle[foot, i] - planned[foot, i])
+            total += force[foot] / carried * (ankle[foot, i] - plan[foot, i])
         drift[i] = total
 
 
@@ -708,12 +706,13 @@ def measure_walk(
         return
     bias = walker.bias[world].imu_attitude
     for i, angle in enumerate((row.roll, row.pitch)):
-        angle_noise = sigma.imu_attitude[i] * noise.imu_attitude[i]
+        error = sigma.imu_attitude[i] * noise.imu_attitude[i]
         measured.imu_attitude[i] = measured_angle(
-            angle, bias[i], angle_noise, quality.imu_bias_rad, quality.imu_sine_error_rad
+            angle, bias[i], error, quality.imu_bias_rad, quality.imu_sine_error_rad
         )
     for i in range(3):
-        measured.imu_rate[i] = noise.imu_rate[i] * sigma.imu_rate[i] + row.pelvis_rate[i]
+        error = noise.imu_rate[i] * sigma.imu_rate[i]
+        measured.imu_rate[i] = error + row.pelvis_rate[i]
 
 
 @compiled_part

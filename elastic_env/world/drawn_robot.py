@@ -43,7 +43,8 @@ def set_joints(
         more_backlash = robot.backlash_rad - scenario.fixed_value("backlash_rad")
         ends = more_backlash * np.array([-0.5, 0.5])
         factor = np.array(robot.stiffness) / scenario.fixed_value("stiffness")
-        field("tendon_lengthspring")[springs] = model.tendon_lengthspring[springs] + ends
+        lengths = model.tendon_lengthspring[springs] + ends
+        field("tendon_lengthspring")[springs] = lengths
         field("tendon_stiffness")[springs] = model.tendon_stiffness[springs] * factor
         field("tendon_damping")[springs] = model.tendon_damping[springs] * robot.damping
     for name in ("dof_frictionloss", "dof_damping"):
@@ -80,7 +81,7 @@ def require_bearable_friction(robot: RobotModel, scenario: Scenario) -> None:
 
 def stiffest_plant(model: mujoco.MjModel, scenario: Scenario) -> mujoco.MjModel:
     """Copy of a plant with the stiffest springs and strongest dampers that a scenario draws."""
-    stiffest = max(part.stiffness[1] * part.joint_stiffness[1] for part in scenario.parts)
+    stiffest = max(p.stiffness[1] * p.joint_stiffness[1] for p in scenario.parts)
     plant = copy.copy(model)
     plant.tendon_stiffness[:] *= stiffest / scenario.fixed_value("stiffness")
     plant.tendon_damping[:] *= max(part.damping[1] for part in scenario.parts)

@@ -188,7 +188,8 @@ class ElasticVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]  
         picture: Callable[[], Picture] | None = None,
     ) -> None:
         if render_mode not in (None, "rgb_array"):
-            raise unknown_name("render mode of a vector environment", render_mode, ["rgb_array"])
+            kind = "render mode of a vector environment"
+            raise unknown_name(kind, render_mode, ["rgb_array"])
         self.render_mode = render_mode
         self._make_picture = picture
         try:
@@ -233,7 +234,7 @@ class ElasticVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]  
             offset = np.where(restarting[:, None], 0.0, offset)
         result = self.task.step(offset)
         if some_restart:
-            result = self._restart_instead_of_step(result, restarting)
+            result = self._restart_instead(result, restarting)
         self._done = done = result.done
         observation = result.observation
         info = result.info
@@ -264,12 +265,12 @@ class ElasticVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]  
         """Free the renderer, release the hardware."""
         self._release()
 
-    def _restart(self, worlds: BoolArray, robot_seeds: list[int | None] | None = None) -> None:
-        seeds = robot_seeds or [None] * self.num_envs
-        self.task.restart(worlds, _episode_generators(self._generators, seeds))
+    def _restart(self, worlds: BoolArray, seeds: list[int | None] | None = None) -> None:
+        robot_seeds = seeds or [None] * self.num_envs
+        self.task.restart(worlds, _episode_generators(self._generators, robot_seeds))
         self._done = self._done & ~worlds
 
-    def _restart_instead_of_step(self, result: Transition, worlds: BoolArray) -> Transition:
+    def _restart_instead(self, result: Transition, worlds: BoolArray) -> Transition:
         """Restart worlds that ended in the last step, for NEXT_STEP; their step does not count."""
         self._restart(worlds)
         info = _info_after_reset(result.info, worlds, self.task.signals())
@@ -307,8 +308,8 @@ def _episode_generators(
 ) -> list[EpisodeRandom]:
     """Generators of new episodes; the robot comes from its seed, if there is one."""
     return [
-        EpisodeRandom(generator) if seed is None else EpisodeRandom(_generator(seed), generator)
-        for generator, seed in zip(generators, robot_seeds, strict=True)
+        EpisodeRandom(rng) if seed is None else EpisodeRandom(_generator(seed), rng)
+        for rng, seed in zip(generators, robot_seeds, strict=True)
     ]
 
 
@@ -353,13 +354,15 @@ def _info_after_reset(info: Info, worlds: BoolArray, signals: Signals) -> Info:
     """Info of a step in which some worlds restart: they have the values of the reset."""
     reset = {**signals, "termination": "", "clipped": 0.0}
     values = {key: np.where(worlds, value, info[key]) for key, value in reset.items()}
-    terms = {key: np.where(worlds, 0.0, term) for key, term in info["reward_terms"].items()}
-    return info | values | {"reward_terms": terms}
+    terms = info["reward_terms"]
+    reset_terms = {key: np.where(worlds, 0.0, term) for key, term in terms.items()}
+    return info | values | {"reward_terms": reset_terms}
 
 
 def _without_metrics(info: Info) -> Info:
     """Info without the entries of the end of an episode."""
-    return {key: info[key] for key in info if key.removeprefix("_") != "episode_metrics"}
+    at_end = ("episode_metrics", "_episode_metrics")
+    return {key: value for key, value in info.items() if key not in at_end}
 
 
 def _info_of_one(info: Info) -> Info:

@@ -67,15 +67,13 @@ class Sensor:
 
     def group(self, name: str, joints: Mirrors) -> SignalGroup:
         """Columns of the sensor on a robot with these joints."""
-        return SignalGroup.of(name, self.unit, self.meaning, self.axes or joints, "measured")
+        parts = self.axes or joints
+        return SignalGroup.of(name, self.unit, self.meaning, parts, "measured")
 
 
 SENSORS: Mapping[str, Sensor] = {
     "link_encoder": Sensor(
-        "rad",
-        "encoder on the link, q in whole counts",
-        lambda truth: truth.q,
-        is_encoder=True,
+        "rad", "encoder on the link, q in whole counts", lambda truth: truth.q, is_encoder=True
     ),
     "joint_torque": Sensor(
         "N·m",
@@ -169,9 +167,9 @@ class FurtherSensors:
         columns = []
         for name, sensor in self._sensors.items():
             value = sensor.truth(truth) + self._offset[name]
-            error = self._scale * sensor.noise * noise[name]
-            is_encoder = sensor.is_encoder
-            columns.append(quantise(value, self._count_rad) if is_encoder else value + error)
+            noisy = value + self._scale * sensor.noise * noise[name]
+            counts = self._count_rad
+            columns.append(quantise(value, counts) if sensor.is_encoder else noisy)
         self._last_values = self._values
         self._values = np.where(worlds[:, None], np.hstack(columns), self._values)
 

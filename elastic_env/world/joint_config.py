@@ -14,7 +14,7 @@ from elastic_env.world.joint_signals import ACTION_BOUND_RAD
 from elastic_env.world.robot_ranges import WALKER_FIELDS
 from elastic_env.world.scenario import Scenario, make_scenario
 
-FRICTION_FIELDS = ("coulomb_friction", "viscous_friction", "load_friction", "static_friction")
+FRICTIONS = ("coulomb_friction", "viscous_friction", "load_friction", "static_friction")
 """Parameters of an `ElasticJoint` that are friction."""
 
 
@@ -55,7 +55,7 @@ class TaskConfig(Model):
     def with_ground_friction(self, joint: ElasticJoint) -> ElasticJoint:
         """Return an assumed joint with the share of friction that acts in the scenario's ground."""
         scale = self.scenario.friction_scale
-        friction = {name: scale * getattr(joint, name) for name in FRICTION_FIELDS}
+        friction = {name: scale * getattr(joint, name) for name in FRICTIONS}
         return joint.replace(**friction)
 
 
@@ -101,7 +101,7 @@ def require_torque(reference: Reference, needed: Array, limits: Array) -> None:
         weakest = np.unravel_index(np.argmax(needed - limits), needed.shape)
         extent = reference.extent()
         raise ConfigurationError(
-            f"the reference {reference.kind!r} can need {needed[weakest]:.4g} N·m of a servo"
-            f" limited to {limits[weakest]:.4g} N·m (|q| up to {extent.q:.2f} rad, |q̈| up to"
-            f" {extent.q_ddot:.2f} rad/s²); lower its amplitude or its rate"
+            f"the reference {reference.kind!r} can need {needed[weakest]:.4g} N·m of a"
+            f" servo limited to {limits[weakest]:.4g} N·m (|q| up to {extent.q:.2f} rad,"
+            f" |q̈| up to {extent.q_ddot:.2f} rad/s²); lower its amplitude or its rate"
         )

@@ -24,14 +24,7 @@ from elastic_env.joint.time_step import require_stable
 from elastic_env.motion.trajectory import Motion, PlanTable
 from elastic_env.rigid.tree.end_effector import EndEffector
 from elastic_env.world import control_kernels as kernels
-from elastic_env.world import records
-from elastic_env.world.drawn_robot import (
-    draws_joints,
-    require_bearable_friction,
-    set_joints,
-    spring_ids,
-    stiffest_plant,
-)
+from elastic_env.world import drawn_robot, records
 from elastic_env.world.further_sensors import SensorInputs
 from elastic_env.world.joint_config import JointConfig
 from elastic_env.world.joint_signals import joint_groups
@@ -180,11 +173,11 @@ class JointTask(Task):
         scenario = config.scenario
         period_s = config.control_period_s
         counts = plant.true.encoder_counts_per_turn if scenario.encoder_counts else None
-        require_bearable_friction(plant.true, scenario)
+        drawn_robot.require_bearable_friction(plant.true, scenario)
         metrics = METRICS_OF_ONE if len(joints) == 1 else METRICS_OF_SEVERAL
         if plant.end_effector is not None:
             metrics = metrics + METRICS_OF_TOOL
-        require_stable(stiffest_plant(plant.model, scenario), period_s)
+        require_stable(drawn_robot.stiffest_plant(plant.model, scenario), period_s)
         super().__init__(
             config=config,
             name=plant.name,
@@ -220,8 +213,8 @@ class JointTask(Task):
             imu_bias_rad=scenario.imu.bias_rad,
             imu_sine_error_rad=scenario.imu.sine_error_rad,
         )
-        self._springs = spring_ids(self.model, joints, config.form)
-        self._has_drawn_joints = draws_joints(scenario)
+        self._springs = drawn_robot.spring_ids(self.model, joints, config.form)
+        self._has_drawn_joints = drawn_robot.draws_joints(scenario)
         has_one_robot = scenario.has_one_robot
         robots = draw_robots(scenario.parts, int(has_one_robot), len(joints), [0])
         self._only_robot = robots[0] if has_one_robot else None
@@ -287,7 +280,7 @@ class JointTask(Task):
                 links = addresses["q_dot"]
                 robot = self._robots[world]
                 scenario = self.config.scenario
-                set_joints(field, self.model, self._springs, links, robot, scenario)
+                drawn_robot.set_joints(field, self.model, self._springs, links, robot, scenario)
         q_ref = self._reference.motion[self._reference.plan_of_world[worlds], 0, 0]
         command = q_ref - truth["homing"]
         factor = truth["stiffness"] / model.stiffness
@@ -300,7 +293,8 @@ class JointTask(Task):
         for column, servo in enumerate(model.servos):
             if servo.integral_gain > 0.0:
                 integrator = self.model.actuator_actadr[addresses["servo"][column]]
-                simulation.act[worlds, integrator] = torque[:, column] / servo.integral_gain
+                windup = torque[:, column] / servo.integral_gain
+                simulation.act[worlds, integrator] = windup
         if self._has_sensors:
             simulation.bind("sensordata")
             simulation.refresh(worlds)
@@ -349,7 +343,7 @@ class JointTask(Task):
         }
         if len(self._joint_names) == 1:
             imu = worlds["measured"]["visible_imu"]
-            signals = {name: values[:, 0].copy() for name, values in joint_signals.items()}
+            signals = {name: rows[:, 0].copy() for name, rows in joint_signals.items()}
             signals["link_angle_imu"] = imu.copy()
             signals["link_error_imu"] = q_ref[:, 0] - imu
         else:
@@ -402,19 +396,14 @@ def _inertial_imu(config: JointConfig, plant: JointPlant, num_worlds: int) -> Pe
         return None
     if any(part.inertial_share < 1.0 for part in scenario.parts):
         raise ConfigurationError(
-            f"scenario {scenario.name!r} gives only some robots an IMU that computes its attitude;"
-            " only the walker supports that, set inertial_share to 0 or 1"
+            f"scenario {scenario.name!r} gives only some robots an IMU that computes"
+            " its attitude; only the walker supports that, set inertial_share to 0 or 1"
         )
     if plant.imu_arm_m is None:
         raise ConfigurationError(
-            f"scenario {scenario.name!r} is about the IMU on a link, which {plant.name} does"
-            " not have; choose another one, or the testbed or the walker"
+            f"scenario {scenario.name!r} is about the IMU on a link, which {plant.name}"
+            " does not have; choose another one, or the testbed or the walker"
         )
     gravity = float(np.linalg.norm(plant.model.opt.gravity))
-    return PendulumImu(
-        scenario.inertial,
-        arm_m=plant.imu_arm_m,
-        gravity_m_s2=gravity,
-        period_s=config.control_period_s,
-        num_worlds=num_worlds,
-    )
+    place = (plant.imu_arm_m, gravity, config.control_period_s)
+    return PendulumImu(scenario.inertial, *place, num_worlds)

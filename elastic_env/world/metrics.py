@@ -66,7 +66,8 @@ def fold(folds: Any, signals: Array, masks: BoolArray, total: Array, count: IntA
             for world in range(values.shape[1]):
                 if is_sampled[step, world]:
                     before = total[row, world]
-                    total[row, world] = add_sample(statistic, before, values[step, world])
+                    value = values[step, world]
+                    total[row, world] = add_sample(statistic, before, value)
                     count[row, world] += 1
 
 

@@ -346,7 +346,9 @@ def simulate(model: MjModel, num_worlds: int, num_threads: int = 0) -> Simulatio
         num_worlds: Number of worlds.
         num_threads: Threads for many worlds, 0 for all cores; the results do not depend on it.
     """
-    return SingleWorld(model) if num_worlds == 1 else ManyWorlds(model, num_worlds, num_threads)
+    if num_worlds == 1:
+        return SingleWorld(model)
+    return ManyWorlds(model, num_worlds, num_threads)
 
 
 MOST_SUBSTEPS = 1000

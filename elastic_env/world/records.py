@@ -31,19 +31,20 @@ def record_type(*fields: tuple[Any, ...]) -> np.dtype[Any]:
     return np.dtype((np.record, np.dtype(list(fields), align=True)))
 
 
-def real_fields(names: str, shape: int | tuple[int, ...] = ()) -> list[tuple[Any, ...]]:
+def floats(names: str, shape: int | tuple[int, ...] = ()) -> list[tuple[Any, ...]]:
     """Fields of real numbers, all of one shape."""
     return [(name, REAL, shape) for name in names.split()]
 
 
 _JOINT_TRUTH = record_type(
-    *real_fields("q_ref theta theta_dot q q_dot"),  # motor and link side [rad], [rad/s]
+    *floats("q_ref theta theta_dot q q_dot"),  # motor and link side [rad], [rad/s]
     # a, θ_cmd = q_ref + a [rad]; change of a [rad/s]
-    *real_fields("offset command command_rate"),
-    *real_fields("stiffness damping"),  # true K [N·m/rad] and D [N·m·s/rad]
-    *real_fields("backlash homing"),  # dead band, and the encoder's offset from θ [rad]
+    *floats("offset command command_rate"),
+    *floats("stiffness damping"),  # true K [N·m/rad] and D [N·m·s/rad]
+    *floats("backlash homing"),  # dead band, and the encoder's offset from θ [rad]
 )
-_JOINT_MEASUREMENTS = record_type(*real_fields("encoder last_encoder"))  # now and a step ago [rad]
+# now, and a step ago [rad]
+_JOINT_MEASUREMENTS = record_type(*floats("encoder last_encoder"))
 JOINT = record_type(("truth", _JOINT_TRUTH), ("measured", _JOINT_MEASUREMENTS))
 """A joint in a control step. Spring, backlash and homing error are drawn per episode."""
 
@@ -69,20 +70,20 @@ ADDRESS = record_type(
 )
 """Indices of a joint in the physics."""
 
-LINK_SCORES = record_type(*real_fields("link_error command_rate divergence"))
+LINK_SCORES = record_type(*floats("link_error command_rate divergence"))
 """Weighted terms of the reward of links on a fixed base, or their weights."""
 
 LINK_WORLD = record_type(
     # scored and rest as in a `Plan`
     ("truth", record_type(*COMMON_TRUTH, ("scored", np.bool_), ("rest", WHOLE))),
     # link angle now, and with the scenario's delay [rad]
-    ("measured", record_type(*real_fields("imu visible_imu"))),
+    ("measured", record_type(*floats("imu visible_imu"))),
     ("scores", LINK_SCORES),
 )
 """A control step of a world with links on a fixed base."""
 
 LINK_CONSTANTS = record_type(
-    ("weights", LINK_SCORES), *real_fields("imu_noise_rad imu_bias_rad imu_sine_error_rad")
+    ("weights", LINK_SCORES), *floats("imu_noise_rad imu_bias_rad imu_sine_error_rad")
 )
 """Constants of links on a fixed base."""
 
@@ -125,4 +126,5 @@ def joint_addresses(model: mujoco.MjModel, joints: Sequence[str]) -> Records:
 def first_columns(table: SignalTable, groups: Sequence[str]) -> Records:
     """First column of each group in a table, as one record, (1,)."""
     record = record_type(*((group, WHOLE) for group in groups))
-    return single_record(record, **{group: table.group(group).start for group in groups})
+    columns = {group: table.group(group).start for group in groups}
+    return single_record(record, **columns)

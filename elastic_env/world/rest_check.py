@@ -18,7 +18,7 @@ _SMALLEST_RAD = 1e-5
 """Smallest motion that causes a warning where a robot does not sag [rad]."""
 _SLOW_LAG_S = 0.15
 """Lag of a servo that does not come to rest within the usual 1.5 s [s]."""
-_LAGS_TO_REST = 8.0
+_LAGS = 8.0
 """Lags after which a servo has 0.03 % of its way left [1]."""
 
 
@@ -86,7 +86,8 @@ class RestWatch:
             self._window = np.where(is_over, -1, window)
             if is_over.any():
                 motion = (self._most - self._least)[:, is_over]
-                self._check_windows(within[-1]["q_ref"][is_over], motion, window[is_over])
+                q_ref = within[-1]["q_ref"][is_over]
+                self._check_windows(q_ref, motion, window[is_over])
 
     def _check_windows(self, q_ref: Array, motion: Array, window: IntArray) -> None:
         """Warn if links moved within windows that are over.
@@ -107,7 +108,8 @@ class RestWatch:
         joint = int(motion[0, worst].argmax())
         weight = f"and the weight bends the joints by {1e3 * sag[worst]:.3g} mrad"
         if sag[worst] < _SMALLEST_RAD:
-            weight = "and no weight bends the joints, so that nothing is there to compensate"
+            nothing = "so that nothing is there to compensate"
+            weight = f"and no weight bends the joints, {nothing}"
         warnings.warn(
             f"joint {self._joints[joint]!r} does not rest where it is scored at rest: at position"
             f" {window[worst] + 1} its link moves by {1e3 * links[worst]:.3g} mrad while it is"
@@ -122,6 +124,5 @@ class RestWatch:
             return "Give the reference a longer settle_s, or joints and servos more damping"
         return (
             f"Its servo takes velocity_gain / position_gain = {lag_s:.2g} s to come near: give the"
-            f" reference a settle_s of {np.ceil(_LAGS_TO_REST * lag_s):g} s, or the servo less"
-            " damping"
+            f" reference a settle_s of {np.ceil(_LAGS * lag_s):g} s, or the servo less damping"
         )

@@ -88,7 +88,7 @@ class RobotModel:
                 " load_friction or static_friction; the policy 'friction' knows both"
             )
 
-    def largest_servo_torque(self, torque: Array) -> Array:
+    def needed_torque(self, torque: Array) -> Array:
         """Largest torque that servos need to move links against friction, (..., n) [N·m].
 
         Args:
@@ -104,7 +104,7 @@ class RobotModel:
             ConfigurationError: A joint has no servo.
         """
         pairs = zip(self.servos, np.moveaxis(speed, -1, 0), strict=True)
-        return np.stack([servo.largest_torque(column) for servo, column in pairs], axis=-1)
+        return np.stack([servo.largest_torque(each) for servo, each in pairs], axis=-1)
 
     def demand(self, torque: Array, speed: Array) -> tuple[Array, Array]:
         """Torques that servos need along a motion, and largest torques that they then have.
@@ -144,11 +144,12 @@ class RobotModel:
         Raises:
             ConfigurationError: A joint has no servo.
         """
-        without = ", ".join(name for name, joint in self.joints.items() if joint.servo is None)
+        servos = {name: joint.servo for name, joint in self.joints.items()}
+        without = ", ".join(name for name, servo in servos.items() if servo is None)
         if without:
             needed = "a servo is needed on every joint"
             raise ConfigurationError(f"{needed}, but there is none on: {without}")
-        return tuple(joint.servo for joint in self.joints.values() if joint.servo is not None)
+        return tuple(servo for servo in servos.values() if servo is not None)
 
     @property
     def servo_compliance(self) -> Array:
@@ -210,8 +211,8 @@ def with_stiffness(
     values = np.asarray(stiffness, dtype=np.float64)
     if values.shape not in {(), (len(joints),)}:
         raise ConfigurationError(
-            f"stiffness must be one number or {len(joints)} of them [N·m/rad], one per joint "
-            f"({', '.join(joints)}), got an array of shape {values.shape}"
+            f"stiffness must be one number or {len(joints)} of them [N·m/rad], one per"
+            f" joint ({', '.join(joints)}), got an array of shape {values.shape}"
         )
     each = np.broadcast_to(values, (len(joints),))
     return {
@@ -227,7 +228,8 @@ def joint_ranges(model: mujoco.MjModel, joints: Sequence[str]) -> tuple[Array, A
     """
     ids = [model.joint(name).id for name in joints]
     limits = model.jnt_range[ids]
-    is_limited = model.jnt_limited[ids, None].astype(bool) & (np.abs(limits) < _NO_LIMIT_RAD)
+    is_near = np.abs(limits) < _NO_LIMIT_RAD
+    is_limited = model.jnt_limited[ids, None].astype(bool) & is_near
     lowest, highest = np.where(is_limited, limits, [-np.inf, np.inf]).T
     return lowest, highest
 
@@ -246,12 +248,12 @@ def read_stiffness(value: Stiffness) -> "float | Array":
     Raises:
         ConfigurationError: The file does not exist or holds no identified stiffness.
     """
-    original = value
+    given = value
     value = plain_numbers(value)
     if isinstance(value, list | tuple):
         if all(type(item) in (int, float) for item in value):
             return np.asarray(value, dtype=np.float64)
-        raise ConfigurationError(f"stiffness must be numbers [N·m/rad], got {quote(original)}")
+        raise ConfigurationError(f"stiffness must be numbers [N·m/rad], got {quote(given)}")
     if isinstance(value, bool) or not isinstance(value, int | float | str | Path):
         raise ConfigurationError(
             f"stiffness must be a number [N·m/rad] or an identification file, got {quote(value)}"
@@ -271,6 +273,6 @@ def read_stiffness(value: Stiffness) -> "float | Array":
         return float(parse_json(content.decode("utf-8"))[STIFFNESS_KEY])
     except (KeyError, TypeError, ValueError):
         raise ConfigurationError(
-            f"{path} is no identification: it must be JSON with a number {STIFFNESS_KEY!r}, see"
-            " `elastic identify`"
+            f"{path} is no identification: it must be JSON with a number"
+            f" {STIFFNESS_KEY!r}, see `elastic identify`"
         ) from None

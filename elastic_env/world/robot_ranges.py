@@ -206,7 +206,7 @@ class DrawnRobot:
     floor_friction: float
 
     def with_exact_sensors(self) -> "DrawnRobot":
-        """Return the robot without push and errors of IMU and feet; it stands as this one does."""
+        """Return the robot without push and errors of IMU and feet; it rests at the same place."""
         feet: dict[str, Any] = dict.fromkeys(FOOT_ERRORS, (0.0,))
         others = {"push_n": 0.0, "is_delayed": False, "is_inertial": False}
         return replace(self, mounting_rad=(0.0, 0.0), **others, **feet)
@@ -262,7 +262,7 @@ def draw_robot(
 
 
 def latin_hypercube(number: int, columns: int, generator: np.random.Generator) -> Array:
-    """Draw points in the unit cube, (number, columns); each of n equal intervals has one value."""
+    """Draw points in the unit cube, (number, columns), in each column one per equal interval."""
     strata = generator.permuted(np.tile(np.arange(number), (columns, 1)), axis=1)
     return (strata + generator.random((columns, number))).T / number
 
@@ -299,9 +299,9 @@ def _draw(
     drawn["push_n"][~has("push_share")] = 0.0
     turns = float(ranges.slope_rad[1] > 0.0)
     drawn["slope_direction_rad"] = 2.0 * np.pi * draw(_DIRECTION, high=turns)
-    shares = {"is_delayed": has("delay_share"), "is_inertial": has("inertial_share")}
+    flags = {"is_delayed": has("delay_share"), "is_inertial": has("inertial_share")}
     for i in range(number):
-        values: dict[str, Any] = {name: bool(share[i]) for name, share in shares.items()}
+        values: dict[str, Any] = {name: bool(flag[i]) for name, flag in flags.items()}
         for name, rows in drawn.items():
             row = tuple(rows[i].tolist())
             values[name] = row if name in _SEVERAL_VALUES else row[0]

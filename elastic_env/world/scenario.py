@@ -63,8 +63,8 @@ class Scenario(RobotRanges):
         super()._check()
         if self.mixture and self.changes:
             raise ValueError(
-                f"mixture sets the robots' ranges; leave out {', '.join(self.changes)}, or give"
-                " it to the ranges of the mixture"
+                f"mixture sets the robots' ranges; leave out {', '.join(self.changes)},"
+                " or give it to the ranges of the mixture"
             )
 
     @property
@@ -110,20 +110,20 @@ class Scenario(RobotRanges):
         return max(abs(end) for part in self.parts for end in part.homing_rad)
 
 
-_SCENARIOS = read_mapping(Path(__file__).with_name("scenarios.yaml"))
-GROUNDS = {name: Scenario(name=name, **fields) for name, fields in _SCENARIOS["grounds"].items()}
-CHANGES: dict[str, dict[str, Any]] = _SCENARIOS["changes"]
+_DATA = read_mapping(Path(__file__).with_name("scenarios.yaml"))
+GROUNDS = {name: Scenario(name=name, **sets) for name, sets in _DATA["grounds"].items()}
+CHANGES: dict[str, dict[str, Any]] = _DATA["changes"]
 """Parameters that a change sets on its ground."""
-TRAINING_RANGES = RobotRanges(**_SCENARIOS["training_ranges"])
+TRAINING_RANGES = RobotRanges(**_DATA["training_ranges"])
 """Ranges of `drawn`."""
-RANGES_BEYOND: list[dict[str, Any]] = _SCENARIOS["ranges_beyond"]
+RANGES_BEYOND: list[dict[str, Any]] = _DATA["ranges_beyond"]
 """Intervals beyond those of `drawn`; each supplies a ninth of the robots of `drawn_beyond`."""
 _LONGEST_NAME = 1000
 """Characters of a joined name that are read."""
 DISTRIBUTIONS = ("drawn", "drawn_beyond")
 """Changes that draw every episode's robot from ranges: `drawn` to learn from; `drawn_beyond` for
 tests, where each robot has one quantity beyond the ranges of `drawn`."""
-WALKER_ONLY = [name for name, fields in CHANGES.items() if fields.keys() <= {*WALKER_FIELDS}]
+WALKER_ONLY = [key for key, sets in CHANGES.items() if sets.keys() <= {*WALKER_FIELDS}]
 """Changes that set only quantities of walkers."""
 
 RangeChanges = Mapping[str, Any] | Sequence[Mapping[str, Any]]
@@ -143,7 +143,7 @@ def _distribution(name: str, ranges: RangeChanges) -> dict[str, Any]:
 
 def _fixed_base_parameters(parameters: dict[str, Any]) -> dict[str, Any]:
     """Parameters of a change that apply to a robot on a fixed base."""
-    rest = {name: value for name, value in parameters.items() if name not in WALKER_FIELDS}
+    rest = {key: value for key, value in parameters.items() if key not in WALKER_FIELDS}
     if "mixture" in rest:
         rest["mixture"] = [part.without_walker_fields() for part in rest["mixture"]]
     return rest
@@ -159,9 +159,9 @@ def _require_ranges(ranges: Any, walks: bool) -> None:
     fields = {field for mapping in mappings for field in mapping}
     walker_fields = sorted(fields & {*WALKER_FIELDS})
     if walker_fields and not walks:
-        choices = ", ".join(name for name in RobotRanges.model_fields if name not in WALKER_FIELDS)
+        choices = [key for key in RobotRanges.model_fields if key not in WALKER_FIELDS]
         problem = f"ranges: only a walker has {', '.join(walker_fields)}"
-        raise ConfigurationError(f"{problem}; here choose from: {choices}")
+        raise ConfigurationError(f"{problem}; here choose from: {', '.join(choices)}")
 
 
 def _merge_into_mixture(parameters: dict[str, Any], name: str) -> dict[str, Any]:

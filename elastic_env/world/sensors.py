@@ -100,8 +100,7 @@ class InertialSensor(Model):
     @property
     def offset_rad(self) -> float:
         """Standard deviation of the offset of roll and pitch [rad]."""
-        rest = self.static_error_rad**2 - self._bias_tilt_rad**2
-        return math.sqrt(max(rest, 0.0))
+        return math.sqrt(max(self.static_error_rad**2 - self._bias_tilt_rad**2, 0.0))
 
     @property
     def _bias_tilt_rad(self) -> float:
@@ -142,8 +141,8 @@ def attitude(sensor: AttitudeSensor, angle: Array, drawn_bias: Array, noise: Arr
     Returns:
         (...) [rad].
     """
-    noise_rad = sensor.noise_rad * noise
-    return measured_angle(angle, drawn_bias, noise_rad, sensor.bias_rad, sensor.sine_error_rad)
+    error = sensor.noise_rad * noise
+    return measured_angle(angle, drawn_bias, error, sensor.bias_rad, sensor.sine_error_rad)
 
 
 def is_due(step: IntArray, rate_hz: float, control_period_s: float) -> BoolArray:
@@ -286,7 +285,8 @@ class PendulumImu:
         turned = q - last[:, 0] + self._period_s * error
         for world in np.flatnonzero(worlds):
             about_y = np.array([0.0, -turned[world], 0.0])
-            kernels.complementary_filter(self._up[world], about_y, force[world], self._gain)
+            up = self._up[world]
+            kernels.complementary_filter(up, about_y, force[world], self._gain)
         self._last[worlds] = np.stack([q, q_dot], axis=1)[worlds]
 
     @property

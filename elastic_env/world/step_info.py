@@ -4,6 +4,8 @@ import functools
 from collections.abc import Callable
 from typing import Any
 
+_Compute = Callable[[], dict[str, Any]]
+
 
 class StepInfo(dict[str, Any]):
     """A dictionary that computes some of its entries at first use.
@@ -17,9 +19,9 @@ class StepInfo(dict[str, Any]):
 
     __slots__ = ("_compute_rest",)
 
-    def __init__(self, known: dict[str, Any], compute_rest: Callable[[], dict[str, Any]]) -> None:
+    def __init__(self, known: dict[str, Any], compute_rest: _Compute) -> None:
         super().__init__(known)
-        self._compute_rest: Callable[[], dict[str, Any]] | None = compute_rest
+        self._compute_rest: _Compute | None = compute_rest
 
     def _complete(self) -> None:
         if self._compute_rest is not None:

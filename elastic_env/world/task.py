@@ -24,23 +24,11 @@ from elastic_env.joint.elasticity import joint_torque
 from elastic_env.motion.trajectory import Motion, PlanTable
 from elastic_env.world import control_kernels as kernels
 from elastic_env.world import further_sensors as further
+from elastic_env.world import joint_signals, records
 from elastic_env.world.further_sensors import FurtherSensors, SensorInputs
-from elastic_env.world.joint_signals import (
-    ACTION_BOUND_RAD,
-    JOINT_COLUMNS,
-    Mirrors,
-    action_table,
-)
 from elastic_env.world.metrics import EpisodeMetrics, Metric
 from elastic_env.world.physics import DIVERGED_RAD_S, Simulation, simulate, substeps
-from elastic_env.world.records import (
-    JOINT,
-    RULES,
-    Records,
-    Sample,
-    first_columns,
-    joint_addresses,
-)
+from elastic_env.world.records import Records, Sample
 from elastic_env.world.robot_model import RobotModel
 from elastic_env.world.robot_ranges import DrawnRobot
 from elastic_env.world.scenario import Scenario
@@ -54,8 +42,8 @@ it silently.
 
 _ROWS_PER_BLOCK = 4096
 """Rows, which are steps of all worlds, whose signals are computed together."""
-_FEWEST_STEPS_PER_BLOCK = 16
-_MOST_STEPS_PER_BLOCK = 256
+_FEWEST_STEPS = 16
+_MOST_STEPS = 256
 """Bounds of the control steps that are scored together."""
 
 
@@ -114,11 +102,11 @@ class Task(ABC):
         motion: Motion,
         table: Sequence[Signal],
         sensors: Sequence[str],
-        joints: Mirrors,
+        joints: joint_signals.Mirrors,
         scenarios: Sequence[Scenario],
         metrics: Sequence[Metric],
         kinds: Sequence[tuple[int | None, bool]],
-        action_bound_rad: float = ACTION_BOUND_RAD,
+        action_bound_rad: float = joint_signals.ACTION_BOUND_RAD,
     ) -> None:
         num_worlds = len(scenarios)
         names = list(joints)
@@ -132,7 +120,7 @@ class Task(ABC):
         self.num_substeps = substeps(config.control_period_s, config.timestep_s)
         self._sensors = FurtherSensors(sensors, joints, scenarios, counts)
         self.observation_table = SignalTable((*table, *self._sensors.signals))
-        self.action_table = action_table(names, action_bound_rad)
+        self.action_table = joint_signals.action_table(names, action_bound_rad)
         self.assumed_model = assumed.with_observation_table(self.observation_table)
         self.metrics = metrics
         self._reference = reference
@@ -140,8 +128,9 @@ class Task(ABC):
         further_terms = type(self).further_reward_terms
         self._has_further_terms = further_terms is not Task.further_reward_terms
         self._width = len(self.observation_table)
-        self._addresses = joint_addresses(model, names)
-        self._columns = first_columns(self.observation_table, JOINT_COLUMNS)
+        self._addresses = records.joint_addresses(model, names)
+        groups = joint_signals.JOINT_COLUMNS
+        self._columns = records.first_columns(self.observation_table, groups)
         self._rules = _joint_rules(config.control_period_s, kinds)
         self._kind = np.zeros(num_worlds, dtype=np.int64)
         self._scenarios = scenarios
@@ -154,14 +143,14 @@ class Task(ABC):
         self._no_reason.flags.writeable = False
         self._has_episode = np.zeros(num_worlds, dtype=np.bool_)
         self._all_have_episodes = False
-        self._constants = (
-            *(self._addresses, self._columns, reference.motion, reference.plan_of_world),
-            *(self._rules, self._kind, self._noise.samples, self._noise.used),
-        )
+        plans = (reference.motion, reference.plan_of_world)
+        noise = (self._noise.samples, self._noise.used)
+        own = (self._addresses, self._columns)
+        self._constants = (*own, *plans, self._rules, self._kind, *noise)
         steps = _ROWS_PER_BLOCK // num_worlds
-        self._steps_per_block = min(max(steps, _FEWEST_STEPS_PER_BLOCK), _MOST_STEPS_PER_BLOCK)
+        self._steps_per_block = min(max(steps, _FEWEST_STEPS), _MOST_STEPS)
         worlds = np.zeros((2, num_worlds), self.world_type)
-        self._begin_block(np.zeros((2, num_worlds, len(names)), JOINT), worlds)
+        self._begin_block(np.zeros((2, num_worlds, len(names)), records.JOINT), worlds)
 
     def attach(
         self, simulation: Simulation | None, num_threads: int, is_scalar: bool = False
@@ -176,12 +165,13 @@ class Task(ABC):
             is_scalar: True if error messages describe one world, whose action has no axis of
                 worlds.
         """
-        self.simulation = simulation or simulate(self.model, self.num_worlds, num_threads)
+        own = simulation or simulate(self.model, self.num_worlds, num_threads)
+        self.simulation = own
         self._is_scalar = is_scalar
         self._metrics = EpisodeMetrics(self.metrics, self.num_worlds)
         # scoring many steps takes 2 ms, half a control period of hardware
         if simulation is not None:
-            self._steps_per_block = _FEWEST_STEPS_PER_BLOCK
+            self._steps_per_block = _FEWEST_STEPS
         compile_now(self._compile_kernels)
 
     def restart(self, worlds: BoolArray, random: Sequence[EpisodeRandom]) -> None:
@@ -419,7 +409,7 @@ class Task(ABC):
     def _begin_block(self, joints: Records, worlds: Records) -> None:
         """Allocate records for the next steps, after those of the last step and the present one."""
         steps = self._steps_per_block + 2
-        self._joints = np.zeros((steps, *joints.shape[1:]), JOINT)
+        self._joints = np.zeros((steps, *joints.shape[1:]), records.JOINT)
         self._worlds = np.zeros((steps, self.num_worlds), self.world_type)
         self._joints[:2] = joints
         self._worlds[:2] = worlds
@@ -469,7 +459,7 @@ class Task(ABC):
 
 def _joint_rules(period_s: float, kinds: Sequence[tuple[int | None, bool]]) -> Records:
     """Records of `RULES`, one per kind of world."""
-    rules = np.zeros(len(kinds), RULES)
+    rules = np.zeros(len(kinds), records.RULES)
     rules["control_period_s"] = period_s
     rules["count_rad"] = [angle_of_count(counts) for counts, _ in kinds]
     rules["is_delayed"] = [is_delayed for _, is_delayed in kinds]

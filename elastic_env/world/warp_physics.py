@@ -126,9 +126,8 @@ class WarpWorlds(Worlds):
             except (NotImplementedError, ValueError) as error:
                 problem = f'the backend "warp" refuses the model: {error}'
                 raise ConfigurationError(problem) from None
-            self._data = mujoco_warp.make_data(
-                self._plant, nworld=num_worlds, nconmax=_CONTACTS, njmax=_CONSTRAINT_ROWS
-            )
+            memory = {"nconmax": _CONTACTS, "njmax": _CONSTRAINT_ROWS}
+            self._data = mujoco_warp.make_data(self._plant, nworld=num_worlds, **memory)
         self._model.opt.warn_overflow = 0  # `_check_results` warns
         self.qpos, self.qvel, self.act, _ = self.views(_STATE)
         self.ctrl = self.bind("ctrl")
@@ -237,8 +236,8 @@ class WarpWorlds(Worlds):
         """Give every world a row of a field of the model on the device."""
         if field not in _WORLD_FIELDS:
             raise ConfigurationError(
-                f'in the backend "warp" all worlds have the same {field}; choose the backend'
-                ' "mujoco" for models that differ in it'
+                f'in the backend "warp" all worlds have the same {field}; choose the'
+                ' backend "mujoco" for models that differ in it'
             )
         shared = getattr(self._model, field)
         shape = (self.num_worlds, *shared.shape[1:])
@@ -262,10 +261,9 @@ class WarpWorlds(Worlds):
 @lru_cache(maxsize=1024)
 def _different_fields(model: MjModel, other: MjModel) -> tuple[str, ...]:
     """Names of the arrays in which two models differ."""
-    arrays = [name for name in dir(model) if isinstance(getattr(model, name), np.ndarray)]
-    return tuple(
-        name for name in arrays if not np.array_equal(getattr(model, name), getattr(other, name))
-    )
+    pairs = [(name, getattr(model, name), getattr(other, name)) for name in dir(model)]
+    arrays = [pair for pair in pairs if isinstance(pair[1], np.ndarray)]
+    return tuple(name for name, a, b in arrays if not np.array_equal(a, b))
 
 
 def _find_device(name: str) -> Any:
@@ -277,7 +275,7 @@ def _find_device(name: str) -> Any:
     try:
         return warp.get_device(name)
     except ValueError:
-        choices = " or ".join(f'device="{device.alias}"' for device in warp.get_devices())
+        choices = " or ".join(f'device="{each.alias}"' for each in warp.get_devices())
         raise ConfigurationError(
             f'the backend "warp" finds no device {quote(name)}, which needs CUDA, on this computer;'
             f' choose {choices}, or for speed without a GPU the backend "mujoco"'

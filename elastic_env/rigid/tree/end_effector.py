@@ -54,7 +54,8 @@ class EndEffector:
         position, _, axes, anchors = self._chain_poses(q)
         J_position, J_rotation = np.zeros((2, len(position), 3, self._n))
         columns = self._chain["column"][:-1]
-        J_position[:, :, columns] = np.cross(axes, position[:, None] - anchors).swapaxes(1, 2)
+        levers = position[:, None] - anchors
+        J_position[:, :, columns] = np.cross(axes, levers).swapaxes(1, 2)
         J_rotation[:, :, columns] = axes.swapaxes(1, 2)
         shape = (*q.shape[:-1], 3, self._n)
         return J_position.reshape(shape), J_rotation.reshape(shape)

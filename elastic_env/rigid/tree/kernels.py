@@ -103,8 +103,7 @@ def gravity_torques(links: Any, loads: Any, q: Array, torque: Array) -> None:
     """
     for start in range(0, len(q), BLOCK):
         rows = q[start : start + BLOCK]
-        of_rows = block_loads(loads, start, len(rows))
-        has_tips = load_links(links, of_rows, rows)
+        has_tips = load_links(links, block_loads(loads, start, len(rows)), rows)
         hold_loads(links, has_tips, torque[start : start + len(rows)])
 
 
@@ -114,8 +113,7 @@ def gravity_gradients(links: Any, loads: Any, q: Array, gradient: Array) -> None
     block = np.zeros((q.shape[1], q.shape[1], min(len(q), BLOCK)))
     for start in range(0, len(q), BLOCK):
         rows = q[start : start + BLOCK]
-        of_rows = block_loads(loads, start, len(rows))
-        has_tips = load_links(links, of_rows, rows)
+        has_tips = load_links(links, block_loads(loads, start, len(rows)), rows)
         differentiate(links, has_tips, len(rows), block)
         for row in range(len(rows)):
             gradient[start + row] = block[:, :, row]
@@ -135,8 +133,8 @@ def solve_legs(links: Any, loads: Any, q: Array, K: Array, torque: Array, x: Arr
         x: Output, (rows, n) [rad].
 
     Returns:
-        True if all are below half a turn. A larger one is no deflection, and the matrix may be
-        singular.
+        True if all solutions are below half a turn. A larger one is no deflection, and the matrix
+        may be singular.
     """
     n = q.shape[1]
     joints = n // len(loads[0].mass)
@@ -146,8 +144,7 @@ def solve_legs(links: Any, loads: Any, q: Array, K: Array, torque: Array, x: Arr
     for start in range(0, len(q), BLOCK):
         rows = q[start : start + BLOCK]
         solution = x[start : start + len(rows)]
-        of_rows = block_loads(loads, start, len(rows))
-        has_tips = load_links(links, of_rows, rows)
+        has_tips = load_links(links, block_loads(loads, start, len(rows)), rows)
         differentiate(links, has_tips, len(rows), gradient)
         if len(torque) > 0:
             solution[:] = torque[start : start + len(rows)]
@@ -211,8 +208,9 @@ def com_and_tips(
         sum_loads(links, len(rows), False)
         mass = links[0]["carried"]
         for row in range(len(rows)):
-            x, y, z = row_vector(links[0]["lever"], row)
-            write_vector(com[start + row], (x / mass[row], y / mass[row], z / mass[row]))
+            x, y, z = get_row(links[0]["lever"], row)
+            m = mass[row]
+            write_vector(com[start + row], (x / m, y / m, z / m))
         for i in range(1, len(links)):
             tip = links[i]["tip"]
             if tip >= 0:
@@ -227,13 +225,13 @@ def com_and_tips(
                     R = as_matrix(links[k]["R"])
                     anchor = as_vector(links[k]["anchor"])
                     for row in range(len(rows)):
-                        moved = to_parent(
-                            R, link["cosine"][row], link["sine"][row], row_vector(place, row)
-                        )
+                        c = link["cosine"][row]
+                        s = link["sine"][row]
+                        moved = to_parent(R, c, s, get_row(place, row))
                         set_row(place, row, add(anchor, moved))
                     k = links[k]["parent"]
                 for row in range(len(rows)):
-                    write_vector(tips[start + row, tip], row_vector(place, row))
+                    write_vector(tips[start + row, tip], get_row(place, row))
     for row in range(len(attitude)):
         R = tilt_rotation(attitude[row, 0], attitude[row, 1])
         write_vector(com[row], matvec(R, as_vector(com[row])))
@@ -275,17 +273,17 @@ def tip_tilts(
                     for row in range(len(rows)):
                         c = link["cosine"][row]
                         s = link["sine"][row]
-                        x, y, z = row_vector(turned, row)
+                        x, y, z = get_row(turned, row)
                         bent = (x, y, z + bending[start + row, column])
                         set_row(turned, row, to_parent(R, c, s, bent))
-                        set_row(normal, row, to_parent(R, c, s, row_vector(normal, row)))
+                        set_row(normal, row, to_parent(R, c, s, get_row(normal, row)))
                     k = links[k]["parent"]
                 for row in range(len(rows)):
                     R = tilt_rotation(attitude[start + row, 0], attitude[start + row, 1])
-                    x, y, _ = matvec(R, row_vector(normal, row))
+                    x, y, _ = matvec(R, get_row(normal, row))
                     measured[start + row, tip, 0] = -y
                     measured[start + row, tip, 1] = x
-                    x, y, _ = matvec(R, row_vector(turned, row))
+                    x, y, _ = matvec(R, get_row(turned, row))
                     expected[start + row, tip, 0] = x
                     expected[start + row, tip, 1] = y
 
@@ -364,7 +362,7 @@ def turn_vertical(links: Any, loads: Any, rows: int) -> None:
         for row in range(rows):
             c = link["cosine"][row]
             s = link["sine"][row]
-            set_row(link["up"], row, to_link(R, c, s, row_vector(above["up"], row)))
+            set_row(link["up"], row, to_link(R, c, s, get_row(above["up"], row)))
 
 
 @compiled_part
@@ -394,16 +392,16 @@ def sum_loads(links: Any, rows: int, has_wrenches: bool) -> None:
             c = link["cosine"][row]
             s = link["sine"][row]
             carried = link["carried"][row]
-            lever = to_parent(R, c, s, row_vector(link["lever"], row))
+            lever = to_parent(R, c, s, get_row(link["lever"], row))
             lever = add(lever, scale(carried, anchor))
-            set_row(above["lever"], row, add(row_vector(above["lever"], row), lever))
+            set_row(above["lever"], row, add(get_row(above["lever"], row), lever))
             above["carried"][row] += carried
             if has_wrenches:
-                force = to_parent(R, c, s, row_vector(link["force"], row))
-                moment = to_parent(R, c, s, row_vector(link["moment"], row))
+                force = to_parent(R, c, s, get_row(link["force"], row))
+                moment = to_parent(R, c, s, get_row(link["moment"], row))
                 moment = add(moment, cross(anchor, force))
-                set_row(above["force"], row, add(row_vector(above["force"], row), force))
-                set_row(above["moment"], row, add(row_vector(above["moment"], row), moment))
+                set_row(above["force"], row, add(get_row(above["force"], row), force))
+                set_row(above["moment"], row, add(get_row(above["moment"], row), moment))
 
 
 @compiled_part
@@ -419,7 +417,7 @@ def load_tip(link: Any, loads: Any, rows: int) -> None:
         force = matvec(R, as_vector(load.wrench[tip, 0]))
         moment = add(matvec(R, as_vector(load.wrench[tip, 1])), cross(place, force))
         link["carried"][row] += mass
-        set_row(link["lever"], row, add(row_vector(link["lever"], row), scale(mass, point)))
+        set_row(link["lever"], row, add(get_row(link["lever"], row), scale(mass, point)))
         set_row(link["force"], row, scale(-1.0, force))
         set_row(link["moment"], row, scale(-1.0, moment))
 
@@ -447,7 +445,7 @@ def hold_loads(links: Any, has_wrenches: bool, torque: Array) -> None:
         link = links[i]
         column = link["column"]
         for row in range(len(torque)):
-            needed = cross(row_vector(link["lever"], row), row_vector(link["up"], row))[2]
+            needed = cross(get_row(link["lever"], row), get_row(link["up"], row))[2]
             if has_wrenches:
                 needed += link["moment"][2, row]
             torque[row, column] = needed
@@ -463,13 +461,13 @@ def differentiate(links: Any, has_wrenches: bool, rows: int, gradient: Array) ->
         force = turned["angular"]
         moment = turned["rate"]
         for row in range(rows):
-            x, y, _ = row_vector(turned["lever"], row)
-            set_row(change, row, cross((-y, x, 0.0), row_vector(turned["up"], row)))
+            x, y, _ = get_row(turned["lever"], row)
+            set_row(change, row, cross((-y, x, 0.0), get_row(turned["up"], row)))
             gradient[column, column, row] = change[2, row]
             if has_wrenches:
-                x, y, _ = row_vector(turned["force"], row)
+                x, y, _ = get_row(turned["force"], row)
                 set_row(force, row, (-y, x, 0.0))
-                x, y, _ = row_vector(turned["moment"], row)
+                x, y, _ = get_row(turned["moment"], row)
                 set_row(moment, row, (-y, x, 0.0))
         i = j
         while links[i]["parent"] != 0:
@@ -481,14 +479,14 @@ def differentiate(links: Any, has_wrenches: bool, rows: int, gradient: Array) ->
             for row in range(rows):
                 c = link["cosine"][row]
                 s = link["sine"][row]
-                set_row(change, row, to_parent(R, c, s, row_vector(change, row)))
+                set_row(change, row, to_parent(R, c, s, get_row(change, row)))
                 gradient[column, before, row] = change[2, row]
                 gradient[before, column, row] = change[2, row]
                 if has_wrenches:
-                    moved = to_parent(R, c, s, row_vector(force, row))
+                    moved = to_parent(R, c, s, get_row(force, row))
                     set_row(force, row, moved)
                     lever = cross(anchor, moved)
-                    moved = add(to_parent(R, c, s, row_vector(moment, row)), lever)
+                    moved = add(to_parent(R, c, s, get_row(moment, row)), lever)
                     set_row(moment, row, moved)
                     gradient[before, column, row] += moved[2]
 
@@ -537,10 +535,10 @@ def move_links(links: Any, q_dot: Array, q_ddot: Array) -> None:
             c = link["cosine"][row]
             s = link["sine"][row]
             joint_rate = q_dot[row, column]
-            rate = row_vector(above["rate"], row)
-            angular = row_vector(above["angular"], row)
+            rate = get_row(above["rate"], row)
+            angular = get_row(above["angular"], row)
             linear = relative_acceleration(anchor, rate, angular)
-            linear = to_link(R, c, s, add(row_vector(above["linear"], row), linear))
+            linear = to_link(R, c, s, add(get_row(above["linear"], row), linear))
             x, y, z = to_link(R, c, s, rate)
             relative = (y * joint_rate, -x * joint_rate, q_ddot[row, column])
             angular = add(to_link(R, c, s, angular), relative)
@@ -637,7 +635,7 @@ def as_matrix(R: Array) -> Matrix:
 
 
 @compiled_part
-def row_vector(field: Array, row: int) -> Vector:
+def get_row(field: Array, row: int) -> Vector:
     """Return the vector of a row."""
     return field[0, row], field[1, row], field[2, row]
 

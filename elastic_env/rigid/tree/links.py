@@ -60,14 +60,16 @@ class Tree:
         for b in range(1, model.nbody):
             inertia = R_li[b] @ np.diag(model.body_inertia[b]) @ R_li[b].T
             share = 1.0 - float(model.body_gravcomp[b])
-            _add_mass(links[carrier[b]], float(model.body_mass[b]), com[b], inertia, share)
+            mass = float(model.body_mass[b])
+            _add_mass(links[carrier[b]], mass, com[b], inertia, share)
         place = _rotate(R_lw, data.xpos - p_wl[carrier])
         return cls(links, carrier, place, R_lw @ data.xmat.reshape(-1, 3, 3))
 
     def add_load(self, body: int, mass: float, place: Array) -> Any:
         """Return the links with a further point mass [kg] at a place in a body [m]."""
         links = self.links.copy()
-        _add_mass(links[self.carrier[body]], mass, self.place[body] + self.R[body] @ place)
+        place = self.place[body] + self.R[body] @ place
+        _add_mass(links[self.carrier[body]], mass, place)
         return links
 
 

@@ -12,17 +12,11 @@ from typing import Any, Literal
 from mujoco import MjModel
 
 from elastic_env.core.errors import ConfigurationError, require_known
-from elastic_env.joint import model_joints
+from elastic_env.joint import joint_settings, model_joints
 from elastic_env.joint.commanded_joints import without_fingers
 from elastic_env.joint.compile_model import compile_spec
 from elastic_env.joint.held_joints import hold_other_joints
-from elastic_env.joint.joint_settings import (
-    HELD,
-    GivenJoints,
-    JointSettings,
-    joint_mapping,
-    key_of,
-)
+from elastic_env.joint.joint_settings import GivenJoints, JointSettings
 from elastic_env.joint.model_file import GivenModel
 from elastic_env.joint.supported_models import require_robot
 from elastic_env.joint.time_step import stable_timestep
@@ -122,13 +116,14 @@ def configure_robot(
         model = compile_spec(robot.elastic(config), "the model with elastic joints")
         timestep_s = stable_timestep(stiffest_plant(model, config.scenario), period_s)
         if timestep_s < (shortest_s := period_s / MOST_SUBSTEPS):
-            name, inertia = assumptions.lightest_links(robot.rigid().compile(), config.joints)
+            rigid = robot.rigid().compile()
+            name, inertia = assumptions.lightest_links(rigid, config.joints)
             raise ConfigurationError(
-                "the joints are too stiff, or their links or rotors too light: in simulation they"
-                f" explode with a physics step of {shortest_s:g} s, the shortest that is played;"
-                " give them less stiffness, or more rotor_inertia. Of the links the fastest are"
-                f" those of joint {name!r}: {inertia:.3g} kg·m² on a spring of"
-                f" {config.joints[name].stiffness:g} N·m/rad"
+                "the joints are too stiff, or their links or rotors too light: in"
+                f" simulation they explode with a physics step of {shortest_s:g} s, the"
+                " shortest that is played; give them less stiffness, or more rotor_inertia."
+                f" Of the links the fastest are those of joint {name!r}: {inertia:.3g}"
+                f" kg·m² on a spring of {config.joints[name].stiffness:g} N·m/rad"
             )
         config = config.replace(timestep_s=timestep_s)
     return config
@@ -163,16 +158,15 @@ def joint_robot(
 def _elastic_hinges(model: MjModel, joints: GivenJoints) -> dict[str, JointSettings]:
     """Settings of the elastic hinges; a pattern does not match coupled fingers."""
     hinges = model_joints.hinges_of(model)
-    mapping = joint_mapping(joints)
+    mapping = joint_settings.joint_mapping(joints)
     names = [model.joint(j).name for j in range(model.njnt)]
     others = [name for name in names if name not in hinges]
     settings = assumptions.elastic_settings(mapping, hinges, others)
-    nameless = key_of(mapping, "")
-    is_meant = nameless is not None and mapping[nameless] != HELD
+    nameless = joint_settings.key_of(mapping, "")
+    is_meant = nameless is not None and mapping[nameless] != joint_settings.HELD
     if is_meant and model_joints.has_nameless_hinge(model):
         raise model_joints.nameless_hinge()
-    moving = without_fingers(model, settings, mapping)
-    return {name: settings[name] for name in moving}
+    return {name: settings[name] for name in without_fingers(model, settings, mapping)}
 
 
 def _home_angles(

@@ -10,14 +10,9 @@ from mujoco import MjModel, MjSpec
 
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
+from elastic_env.joint import joint_settings
 from elastic_env.joint.elasticity import ElasticJoint, Servo
-from elastic_env.joint.joint_settings import (
-    CURE,
-    GivenJoints,
-    JointSettings,
-    ServoSettings,
-    read_joints,
-)
+from elastic_env.joint.joint_settings import JointSettings, ServoSettings
 from elastic_env.joint.model_joints import home_of, mass_matrix
 from elastic_env.joint.model_servo import force_limit, position_servo, rotor_inertia
 from elastic_env.rigid.rigid_body import RigidBody
@@ -61,7 +56,7 @@ _MASS_POSES = 20
 
 
 def elastic_settings(
-    given: GivenJoints, hinges: Sequence[str], others: Sequence[str] = ()
+    given: joint_settings.GivenJoints, hinges: Sequence[str], others: Sequence[str] = ()
 ) -> dict[str, JointSettings]:
     """Settings of the joints with springs, by name, in the order of the model.
 
@@ -77,7 +72,7 @@ def elastic_settings(
             that gives way.
     """
     elastic: dict[str, JointSettings] = {}
-    for name, settings in read_joints(given, hinges, others).items():
+    for name, settings in joint_settings.read_joints(given, hinges, others).items():
         if settings is None:
             continue
         gain = settings.servo.sagging_gain(name)
@@ -85,14 +80,14 @@ def elastic_settings(
             elastic[name] = settings
         elif np.isfinite(gain):
             raise ConfigurationError(
-                f"joint {name!r} is rigid and its servo gives way, which is not simulated; give it"
-                f" a stiffness K [N·m/rad] well above its position_gain of {gain:g}, such as"
-                f" {STIFF_OVER_SERVO * gain:g}"
+                f"joint {name!r} is rigid and its servo gives way, which is not"
+                " simulated; give it a stiffness K [N·m/rad] well above its"
+                f" position_gain of {gain:g}, such as {STIFF_OVER_SERVO * gain:g}"
             )
     if not elastic:
         raise ConfigurationError(
-            f"joints gives no joint its stiffness K [N·m/rad]; choose from {', '.join(hinges)}, or"
-            f" '*' for all. {CURE}"
+            "joints gives no joint its stiffness K [N·m/rad]; choose from"
+            f" {', '.join(hinges)}, or '*' for all. {joint_settings.CURE}"
         )
     return elastic
 
@@ -123,7 +118,8 @@ def elastic_joints(
     inertias = _link_inertias(model, names, poses)
     joints: dict[str, ElasticJoint] = {}
     notes: list[str] = []
-    for (name, values), *figures in zip(settings.items(), torque, *inertias, strict=True):
+    rows = zip(settings.items(), torque, *inertias, strict=True)
+    for (name, values), *figures in rows:
         links = _Links(*map(float, figures))
         joints[name] = _JointBuilder(model, name, values, links, notes).build()
     if notes:
@@ -239,10 +235,11 @@ class _JointBuilder:
         most = max(self.links.most, velocity_gain / _FASTEST_PER_S)
         if by_frequency <= most:
             return by_frequency
-        scale = "its links have" if most == self.links.most else "its velocity gain needs"
+        is_of_links = most == self.links.most
+        scale = "its links have" if is_of_links else "its velocity gain needs"
         self.notes.append(
-            f"rotor_inertia of {self.name} {most:.3g} kg·m², as much as {scale}, as K/(100 rad/s)²"
-            f" would be {by_frequency:.3g}"
+            f"rotor_inertia of {self.name} {most:.3g} kg·m², as much as {scale}, as"
+            f" K/(100 rad/s)² would be {by_frequency:.3g}"
         )
         return most
 
@@ -287,8 +284,8 @@ class _JointBuilder:
             kv = max(critical - back_emf, 0.0)
             if known.position_gain is not None and not is_given:
                 self.notes.append(
-                    f"velocity_gain of {self.name} {kv:.3g} N·m·s/rad, critical damping, as"
-                    " nothing in the model damps its servo"
+                    f"velocity_gain of {self.name} {kv:.3g} N·m·s/rad, critical"
+                    " damping, as nothing in the model damps its servo"
                 )
         enough = _TORQUE_RESERVE * links.torque + _RESERVE_RAD_S2 * (rotor + links.most)
         limit = known.torque_limit

@@ -34,9 +34,9 @@ def read_robot(model: GivenModel) -> mujoco.MjSpec:
     content = read_model(model, shapes=True)
     if content.lost:
         warnings.warn(
-            f"{len(content.lost)} meshes of {content.name} are missing or in a format that MuJoCo"
-            f" cannot read, such as {quote(content.lost[0])[1:-1]}; rods between the joints are"
-            " drawn in their place",
+            f"{len(content.lost)} meshes of {content.name} are missing or in a format"
+            f" that MuJoCo cannot read, such as {quote(content.lost[0])[1:-1]}; rods"
+            " between the joints are drawn in their place",
             stacklevel=4,
         )
         add_simple_bodies(content.spec)

@@ -49,6 +49,7 @@ class TestbedConfig(JointConfig):
         spec = testbed.elastic_spec(pendulum, joint, self.form, self.timestep_s)
         if ACCELEROMETER in self.sensors:
             add_accelerometer(spec, "imu")
+        plan = partial(reference.plan_about, np.zeros(1))
         return JointPlant(
             name=NAME,
             model=spec.compile(),
@@ -57,7 +58,7 @@ class TestbedConfig(JointConfig):
             form=self.form,
             static_torque=pendulum.torque,
             torque_gradient=pendulum.torque_gradient,
-            motion=Motion(partial(reference.plan_about, np.zeros(1)), reference.is_random),
+            motion=Motion(plan, reference.is_random),
             imu_arm_m=testbed.imu_arm(pendulum),
         )
 
@@ -84,6 +85,6 @@ class TestbedConfig(JointConfig):
             + (pendulum.inertia + joint.rotor_inertia) * extent.q_ddot
             + joint.viscous_friction * extent.q_dot
         )
-        passed = robot.largest_servo_torque(np.array([needed]))
+        passed = robot.needed_torque(np.array([needed]))
         limits = robot.largest_torque(np.array([extent.q_dot]))
         require_torque(self.reference, passed, limits)

@@ -74,7 +74,7 @@ class WalkConfig(TaskConfig):
     """Massless bodies on the torso, so that all robots have the same number of bodies [1]."""
 
     def _check(self) -> None:
-        if any(varies(joint) or (joint.servo and joint.servo.motor) for joint in self.joints):
+        if any(varies(j) or (j.servo and j.servo.motor) for j in self.joints):
             raise ValueError(
                 "joints of the walker must have neither load_friction nor static_friction nor a"
                 " motor, which its plan and policies do not know; the testbed and Robot-v0 do"
@@ -85,17 +85,17 @@ class WalkConfig(TaskConfig):
             raise ValueError("fewest_steps is for walks in place, whose strides are all alike")
         if fewest > most or (most - fewest) % 2:
             raise ValueError(
-                f"fewest_steps must be num_steps = {most} less whole strides of two steps, got"
-                f" {fewest}"
+                f"fewest_steps must be num_steps = {most} less whole strides of two"
+                f" steps, got {fewest}"
             )
-        frictions = {scenario.friction_scale: scenario.name for scenario in self.scenarios}
-        rates = {scenario.pelvis_imu.rate_hz: scenario.name for scenario in self.scenarios}
+        frictions = {part.friction_scale: part.name for part in self.scenarios}
+        rates = {part.pelvis_imu.rate_hz: part.name for part in self.scenarios}
         common = {"friction_scale": frictions, "rate_hz of pelvis_imu": rates}
         for field, names in common.items():
             if len(names) > 1:
-                got = " and ".join(f"{value:g} of {name!r}" for value, name in names.items())
+                got = [f"{value:g} of {name!r}" for value, name in names.items()]
                 needed = f"the scenarios of all worlds must have the same {field}"
-                raise ValueError(f"{needed}, got {got}")
+                raise ValueError(f"{needed}, got {' and '.join(got)}")
 
     @property
     def numbers_of_steps(self) -> range:
@@ -107,10 +107,10 @@ class WalkConfig(TaskConfig):
         """Configurations of the scenarios, in the order of their first occurrence."""
         if not self.scenarios:
             return [self]
-        scenarios = dict.fromkeys(self.scenarios)
-        configs = [self.replace(scenario=scenario, scenarios=()) for scenario in scenarios]
+        parts = dict.fromkeys(self.scenarios)
+        configs = [self.replace(scenario=part, scenarios=()) for part in parts]
         most = max(config.num_loads for config in configs)
-        return [config.replace(spare_bodies=most - config.num_loads) for config in configs]
+        return [each.replace(spare_bodies=most - each.num_loads) for each in configs]
 
     @property
     def num_loads(self) -> int:
@@ -137,7 +137,8 @@ class WalkConfig(TaskConfig):
 
     def true_model(self) -> MjModel:
         """Compile the plant without drawn parameters; a load to be drawn has no mass."""
-        spec = thormang.elastic_spec(self.true_robot, self.true_joints, self.form, self.timestep_s)
+        joints = self.true_joints
+        spec = thormang.elastic_spec(self.true_robot, joints, self.form, self.timestep_s)
         if self.scenario.places_loads:
             thormang.add_load(spec, DRAWN_LOAD, 0.0, np.zeros(3))
         for number in range(self.spare_bodies):

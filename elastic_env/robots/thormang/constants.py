@@ -12,15 +12,9 @@ from elastic_env.motion import walk_plan
 from elastic_env.motion.gait import RIGHT
 from elastic_env.motion.trajectory import STAND_S
 from elastic_env.motion.walk_plan import WalkPlan
+from elastic_env.robots.thormang import config as walk_config
 from elastic_env.robots.thormang import records, tables
-from elastic_env.robots.thormang.config import (
-    FALL_HEIGHT_SHARE,
-    FALL_TILT_RAD,
-    WalkConfig,
-    require_stable_walker,
-    robot_bank,
-    undrawn_model,
-)
+from elastic_env.robots.thormang.config import WalkConfig
 from elastic_env.robots.thormang.model import SIDES, biped
 from elastic_env.world import control_kernels as kernels
 from elastic_env.world.foot_sensors import FootSensors
@@ -57,14 +51,15 @@ class RobotKind:
     @staticmethod
     def of(config: WalkConfig, plan: WalkPlan) -> "RobotKind":
         """Make the robots of a configuration and a planned motion."""
-        require_stable_walker(config)  # pyright: ignore[reportArgumentType]  frozen models can be hashed
-        bank = robot_bank(config.scenario, config.bank)
+        walk_config.require_stable_walker(config)  # pyright: ignore[reportArgumentType]  frozen models can be hashed
+        bank = walk_config.robot_bank(config.scenario, config.bank)
         body = biped(config.true_robot)  # pyright: ignore[reportArgumentType]
         period_s = config.control_period_s
         if config.true_robot != config.robot:
             plan = walk_plan.with_torque(plan, body, period_s)
-        true_model = WalkerModel(config.true_joints, body.rigid, period_s, biped=body, plan=plan)
-        plant = copy.copy(undrawn_model(config))  # pyright: ignore[reportArgumentType]
+        joints = config.true_joints
+        true_model = WalkerModel(joints, body.rigid, period_s, biped=body, plan=plan)
+        plant = copy.copy(walk_config.undrawn_model(config))  # pyright: ignore[reportArgumentType]
         return RobotKind(config, bank, plant, true_model)
 
     @property
@@ -76,7 +71,8 @@ class RobotKind:
     @property
     def sensor_variants(self) -> list[tuple[bool, bool]]:
         """Pairs of its robots: True for delayed measurements, True for an inertial IMU."""
-        return list(dict.fromkeys((robot.is_delayed, robot.is_inertial) for robot in self.bank))
+        pairs = [(robot.is_delayed, robot.is_inertial) for robot in self.bank]
+        return list(dict.fromkeys(pairs))
 
 
 def plan_rows(plan: WalkPlan, config: WalkConfig) -> Records:
@@ -127,10 +123,12 @@ def walk_constants(kind: RobotKind, is_inertial: bool) -> Records:
         noise[group] = deviation
     model = kind.model
     feet = [model.body(f"{side}_foot").id for side in SIDES]
-    sensors = FootSensors(model.body_mass[feet], model.body_ipos[feet], model.opt.gravity.copy())
+    gravity = model.opt.gravity.copy()
+    sensors = FootSensors(model.body_mass[feet], model.body_ipos[feet], gravity)
     g = biped(config.robot).gravity  # pyright: ignore[reportArgumentType]  frozen models can be hashed
     loaded_n = _UNLOADED_SHARE * float(model.body_mass.sum()) * g
-    weights = {term: getattr(config.reward, term) for term in records.SCORES.names or ()}
+    terms = records.SCORES.names or ()
+    weights = {term: getattr(config.reward, term) for term in terms}
     before_skip_s = STAND_S + _STEPS_BEFORE_SKIP * config.gait.step_period_s
     return single_record(
         records.CONSTANTS,
@@ -140,8 +138,8 @@ def walk_constants(kind: RobotKind, is_inertial: bool) -> Records:
         noise=noise,
         imu_bias_rad=scenario.pelvis_imu.bias_rad,
         imu_sine_error_rad=scenario.pelvis_imu.sine_error_rad,
-        lowest_pelvis_m=FALL_HEIGHT_SHARE * config.gait.hip_height_m,
-        highest_tilt_rad=FALL_TILT_RAD,
+        lowest_pelvis_m=walk_config.FALL_HEIGHT_SHARE * config.gait.hip_height_m,
+        highest_tilt_rad=walk_config.FALL_TILT_RAD,
         loaded_n=loaded_n,
         # sensors without load mean that the ground carries only the feet
         zmp_n=loaded_n + float(model.body_mass[feet].sum()) * g,

@@ -64,13 +64,13 @@ def configure_walk(
         ConfigurationError: A name, a parameter or a combination that does not exist.
     """
     if not isinstance(gait, dict | None):
-        raise ConfigurationError(
-            f"gait must be a mapping of {', '.join(_GAIT_FIELDS)}, got {quote(gait)}; see also"
-            " step_period"
-        )
-    require_known("parameter of gait beside step_period and num_steps", gait or {}, _GAIT_FIELDS)
+        needed = f"gait must be a mapping of {', '.join(_GAIT_FIELDS)}"
+        raise ConfigurationError(f"{needed}, got {quote(gait)}; see also step_period")
+    kind = "parameter of gait beside step_period and num_steps"
+    require_known(kind, gait or {}, _GAIT_FIELDS)
     thormang = as_model("robot", robot, Thormang())
-    joints = {name: as_model("joint", joint, default) for name, default in thormang.joints.items()}
+    usual = thormang.joints
+    joints = {name: as_model("joint", joint, usual[name]) for name in usual}
     if stiffness is not None:
         joints = with_stiffness(joints, read_stiffness(stiffness))
     steps = {} if num_steps is None else {"num_steps": num_steps}

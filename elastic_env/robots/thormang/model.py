@@ -47,7 +47,7 @@ SOLE_HALF_SIZE_M = (0.13, 0.08)
 _SOLE_HALF_THICKNESS = 0.01
 _LOAD_GYRATION_M = 0.1
 _TORSO = "upper_body"
-_DOUBLED_FIELDS = ("stiffness", "rotor_inertia", "damping", "coulomb_friction")
+_DOUBLED = ("stiffness", "rotor_inertia", "damping", "coulomb_friction")
 """Parameters of a joint that two servos double."""
 
 
@@ -205,8 +205,9 @@ def _add_sole(foot: MjsBody, side: str, friction: float) -> None:
 def _twin_joint(joint: ElasticJoint) -> ElasticJoint:
     """Return the joint with two parallel servos instead of one."""
     servo = joint.servo
-    doubled: dict[str, Any] = {name: 2.0 * getattr(joint, name) for name in _DOUBLED_FIELDS}
+    doubled: dict[str, Any] = {name: 2.0 * getattr(joint, name) for name in _DOUBLED}
     if servo is not None:
         gains = ("position_gain", "velocity_gain", "integral_gain", "torque_limit")
-        doubled["servo"] = servo.replace(**{gain: 2.0 * getattr(servo, gain) for gain in gains})
+        changes = {gain: 2.0 * getattr(servo, gain) for gain in gains}
+        doubled["servo"] = servo.replace(**changes)
     return joint.replace(**doubled)

@@ -121,7 +121,8 @@ def enlarge_posture(
     is_within_reach = (np.linalg.norm(legs, axis=-1) <= robot.leg.reach).all(axis=-1)
     is_within_reach[-1] = True  # the true posture
     first = int(np.argmax(is_within_reach))
-    return Posture(pelvis[first], R[first], true.ankles, true.feet_R), float(factors[first])
+    enlarged = Posture(pelvis[first], R[first], true.ankles, true.feet_R)
+    return enlarged, float(factors[first])
 
 
 class WalkerPicture(Picture):
@@ -190,7 +191,8 @@ class WalkerPicture(Picture):
 
     def _place(self, prefix: str, posture: Posture, robot: Biped) -> None:
         """Move one of the two robots into a posture."""
-        self._data.joint(f"{prefix}pelvis").qpos = _pose_vector(posture.pelvis, posture.R)
+        pelvis = _pose_vector(posture.pelvis, posture.R)
+        self._data.joint(f"{prefix}pelvis").qpos = pelvis
         for joint, angle in zip(LEG_JOINTS, posture.joint_angles(robot), strict=True):
             self._data.joint(prefix + joint).qpos = angle
 

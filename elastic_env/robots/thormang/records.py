@@ -7,36 +7,36 @@ import numpy as np
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
 from elastic_env.robots.thormang.tables import GROUPS, MEASURED
-from elastic_env.world.records import COMMON_TRUTH, REAL, WHOLE, real_fields, record_type
+from elastic_env.world.records import COMMON_TRUTH, REAL, WHOLE, floats, record_type
 from elastic_env.world.robot_model import WalkerModel
 
 _WRENCH_SHAPE = (2, 2, 3)  # feet, force and moment, axes
 
 TRUTH = record_type(
     *COMMON_TRUTH,
-    *real_fields("servo_torque"),  # rms over the joints [N·m]
-    *real_fields("pelvis", 3),  # position [m]
-    *real_fields("quaternion", 4),  # orientation w, x, y, z
+    *floats("servo_torque"),  # rms over the joints [N·m]
+    *floats("pelvis", 3),  # position [m]
+    *floats("quaternion", 4),  # orientation w, x, y, z
     # velocity of the origin, where the IMU is, in the world [m/s]; rate in the pelvis frame [rad/s]
-    *real_fields("pelvis_velocity pelvis_rate", 3),
-    *real_fields("roll pitch tilt"),  # of yaw, pitch, roll; angle from the vertical [rad]
-    *real_fields("ankles", (2, 3)),  # positions [m]
+    *floats("pelvis_velocity pelvis_rate", 3),
+    *floats("roll pitch tilt"),  # of yaw, pitch, roll; angle from the vertical [rad]
+    *floats("ankles", (2, 3)),  # positions [m]
     # wrench of the feet on the legs, in the frames of the feet [N], [N·m]
-    *real_fields("wrench", _WRENCH_SHAPE),
+    *floats("wrench", _WRENCH_SHAPE),
     # vertical force of the ground on the feet [N]; ZMP, and drift of the standing feet from the
     # plan [m], nan where the feet are not loaded
-    *real_fields("force zmp drift", 2),
+    *floats("force zmp drift", 2),
     # step of the first touch-down in the second half of the swing, -1 before it
     ("contact_since", WHOLE),
 )
 """True state after a control step."""
 
 MEASUREMENTS = record_type(
-    *real_fields("imu_attitude", 2),  # roll and pitch [rad]
-    *real_fields("imu_rate", 3),  # as pelvis_rate [rad/s]
-    *real_fields("wrench", _WRENCH_SHAPE),  # as in the truth
+    *floats("imu_attitude", 2),  # roll and pitch [rad]
+    *floats("imu_rate", 3),  # as pelvis_rate [rad/s]
+    *floats("wrench", _WRENCH_SHAPE),  # as in the truth
     # in an inertial IMU: vertical in its frame by its filter [1], rate by its gyroscope [rad/s]
-    *real_fields("imu_up imu_gyro", 3),
+    *floats("imu_up imu_gyro", 3),
 )
 """Measurements, and the state of an inertial IMU."""
 
@@ -48,40 +48,40 @@ the signals.
 """
 
 BIAS = record_type(
-    *real_fields("imu_attitude", 2),  # of mounting [rad]
-    *real_fields("gyro specific_force", 3),  # within an inertial IMU [rad/s], [m/s²]
+    *floats("imu_attitude", 2),  # of mounting [rad]
+    *floats("gyro specific_force", 3),  # within an inertial IMU [rad/s], [m/s²]
     # errors of the feet's sensors, as in `elastic_env.world.foot_sensors`
     ("has_foot_errors", np.bool_),
-    *real_fields("wrench wrench_rate", _WRENCH_SHAPE),  # [N], [N·m]; [N/s], [N·m/s]
-    *real_fields("cross_talk", (2, 6, 6)),
+    *floats("wrench wrench_rate", _WRENCH_SHAPE),  # [N], [N·m]; [N/s], [N·m/s]
+    *floats("cross_talk", (2, 6, 6)),
     ("skipped", WHOLE),  # control steps of the plan that the walk leaves out
     # properties of the robot that nothing measures: load [kg] and its moments [kg·m], slope of the
     # ground forward and to the left [rad], friction over the assumed friction [1]
-    *real_fields("load", 3),
-    *real_fields("slope", 2),
-    *real_fields("friction"),
+    *floats("load", 3),
+    *floats("slope", 2),
+    *floats("friction"),
 )
 """Values drawn per episode: errors of the sensors, length of the walk, and robot."""
 
-SCORES = record_type(*real_fields("tilt zmp zmp_in_feet foot_drift effort smoothness fall"))
+SCORES = record_type(*floats("tilt zmp zmp_in_feet foot_drift effort smoothness fall"))
 """Weighted terms of the reward."""
 
 WORLD = record_type(("truth", TRUTH), ("measured", MEASUREMENTS), ("scores", SCORES))
 """A control step of a world."""
 
 PLAN_ROW = record_type(
-    *real_fields("clock", 3),  # time, swing, support
-    *real_fields("share"),  # μ
-    *real_fields("zmp", 2),  # [m]
-    *real_fields("ankles", (2, 3)),  # [m]
+    *floats("clock", 3),  # time, swing, support
+    *floats("share"),  # μ
+    *floats("zmp", 2),  # [m]
+    *floats("ankles", (2, 3)),  # [m]
     ("half_of_swing", WHOLE),
     ("swing_foot", WHOLE),
     ("imu_is_due", np.bool_),
-    *real_fields("weight"),  # factor of tilt and zmp in the reward
+    *floats("weight"),  # factor of tilt and zmp in the reward
 )
 """The walk plan in a control step."""
 
-INERTIAL = record_type(("is_fitted", np.bool_), *real_fields("time_constant_s gravity_m_s2"))
+INERTIAL = record_type(("is_fitted", np.bool_), *floats("time_constant_s gravity_m_s2"))
 """An inertial IMU; every row of `CONSTANTS` has one.
 
 Where none is fitted, the attitude has the errors in `CONSTANTS`.
@@ -89,12 +89,12 @@ Where none is fitted, the attitude has the errors in `CONSTANTS`.
 
 CONSTANTS = record_type(
     ("ankles", WHOLE, 2),  # among the sites
-    *real_fields("foot_com foot_weight", (2, 3)),  # from the ankle [m], in the world [N]
+    *floats("foot_com foot_weight", (2, 3)),  # from the ankle [m], in the world [N]
     ("noise", NOISE),  # standard deviations
-    *real_fields("imu_bias_rad imu_sine_error_rad"),
-    *real_fields("lowest_pelvis_m highest_tilt_rad"),  # beyond these the robot has fallen
+    *floats("imu_bias_rad imu_sine_error_rad"),
+    *floats("lowest_pelvis_m highest_tilt_rad"),  # beyond these the robot has fallen
     # least vertical force of a loaded foot, and least one of both feet for a ZMP
-    *real_fields("loaded_n zmp_n"),
+    *floats("loaded_n zmp_n"),
     # control step from which a shorter walk jumps ahead in the plan
     ("skip_step", WHOLE),
     ("weights", SCORES),
@@ -158,7 +158,7 @@ class WalkTruth:
         model, *others = self.models
         if others:
             raise ConfigurationError(
-                f"the worlds of {len(self.models)} scenarios have no true model in common; make an"
-                " environment for each"
+                f"the worlds of {len(self.models)} scenarios have no true model in"
+                " common; make an environment for each"
             )
         return model

@@ -110,9 +110,9 @@ def settle(
             return Equilibrium(*(values.copy() for values in state))
         was_slow = is_slow
     raise ElasticError(
-        f"the robot does not stand: pelvis at {data.qpos[2]:.3f} m (planned {pelvis[2]:.3f} m) and"
-        f" moving with {np.abs(data.qvel).max():.2g} rad/s or m/s after {data.time:.1f} s; is a"
-        " joint too soft for the load?"
+        f"the robot does not stand: pelvis at {data.qpos[2]:.3f} m (planned"
+        f" {pelvis[2]:.3f} m) and moving with {np.abs(data.qvel).max():.2g} rad/s or"
+        f" m/s after {data.time:.1f} s; is a joint too soft for the load?"
     )
 
 
@@ -121,8 +121,8 @@ def _divergence_error(model: MjModel, data: mujoco.MjData) -> ElasticError:
     # all tendons are springs of elastic joints
     stiffest = model.tendon_stiffness.max(initial=0.0)
     return ElasticError(
-        f"the simulation of the standing robot diverges within {data.time:.2f} s: with a largest K"
-        f" of {stiffest:g} N·m/rad its joints are too stiff, or their links or rotors too light,"
-        f" for timestep_s = {model.opt.timestep:g} s; lower the stiffness or take a shorter"
-        " timestep_s"
+        f"the simulation of the standing robot diverges within {data.time:.2f} s: with"
+        f" a largest K of {stiffest:g} N·m/rad its joints are too stiff, or their links"
+        f" or rotors too light, for timestep_s = {model.opt.timestep:g} s; lower the"
+        " stiffness or take a shorter timestep_s"
     )

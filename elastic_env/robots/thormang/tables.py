@@ -33,8 +33,7 @@ def _group(name: str, rows: list[dict[str, Any]]) -> SignalGroup:
 _SHAPES = {"wrench": (2, 2, 3)}
 """Shapes of groups: feet, force and moment, axes."""
 _rows_by_group = itertools.groupby(
-    read_rows(Path(__file__).with_name("signals.csv")),
-    key=lambda row: row["name"].split(".")[0],
+    read_rows(Path(__file__).with_name("signals.csv")), key=lambda row: row["name"].split(".")[0]
 )
 GROUPS = tuple(_group(name, list(rows)) for name, rows in _rows_by_group)
 """Groups of the observation, from `signals.csv`."""

@@ -105,10 +105,11 @@ class WalkTask(Task):
         robot = biped(config.robot)  # pyright: ignore[reportArgumentType]  frozen models can be hashed
         period_s = config.control_period_s
         plan = plan_walk(config.gait, robot, period_s)  # pyright: ignore[reportArgumentType]
-        assumed = WalkerModel(config.assumed_joints, robot.rigid, period_s, biped=robot, plan=plan)
+        joints = config.assumed_joints
+        assumed = WalkerModel(joints, robot.rigid, period_s, biped=robot, plan=plan)
         walk_plan.require_feasible(plan, robot, assumed.servos)
         kinds = [RobotKind.of(part, plan) for part in config.scenario_configs()]
-        self._variants = [(kind, *pair) for kind in kinds for pair in kind.sensor_variants]
+        self._variants = [(kind, *v) for kind in kinds for v in kind.sensor_variants]
         super().__init__(
             config=config,
             name=NAME,
@@ -120,28 +121,28 @@ class WalkTask(Task):
             joints=tables.JOINTS,
             scenarios=scenarios,
             metrics=tables.METRICS,
-            kinds=[(kind.encoder_counts, is_delayed) for kind, is_delayed, _ in self._variants],
+            kinds=[(kind.encoder_counts, late) for kind, late, _ in self._variants],
         )
         table = self.observation_table
         by_scenario = {kind.config.scenario: kind for kind in kinds}
         self.plan = plan
         self._kinds = kinds
-        self._true_models = tuple(kind.true_model.with_observation_table(table) for kind in kinds)
+        models = [kind.true_model.with_observation_table(table) for kind in kinds]
+        self._true_models = tuple(models)
         self._kind_of_world = [by_scenario[scenario] for scenario in scenarios]
         self._torso = self.model.body("upper_body").id
         self._phases = constants.phase_masks(plan)
         self._bias = np.zeros(num_worlds, records.BIAS)
         step_rows = round(plan.gait.step_period_s / period_s)
         most = plan.gait.num_steps
-        self._skips = [step_rows * (most - number) for number in config.numbers_of_steps]
+        self._skips = [step_rows * (most - steps) for steps in config.numbers_of_steps]
         self.fewest_control_steps = self.num_steps - max(self._skips)
-        self._walk_constants = np.concatenate(
-            [constants.walk_constants(kind, inertial) for kind, _, inertial in self._variants]
-        )
+        rows = [constants.walk_constants(kind, fitted) for kind, _, fitted in self._variants]
+        self._walk_constants = np.concatenate(rows)
         self._inertial = constants.inertial_constants(self._variants, robot.gravity)
         self._plan_rows = constants.plan_rows(plan, config)
         self._walk_columns = first_columns(table, records.COLUMNS)
-        self._has_pushes = any(drawn.push_n > 0.0 for kind in kinds for drawn in kind.bank)
+        self._has_push = any(each.push_n > 0.0 for kind in kinds for each in kind.bank)
         push_s = np.array([scenario.push_s for scenario in scenarios])
         self._push_steps = (push_s / period_s).round()
         self._push_force = np.zeros((num_worlds, 3))
@@ -236,7 +237,7 @@ class WalkTask(Task):
 
     def _disturb(self) -> None:
         """Push the torso during the drawn time."""
-        if self._has_pushes:
+        if self._has_push:
             steps = self._worlds[self._row]["truth"]["step"] - self._push_begin
             is_pushed = (steps >= 0) & (steps < self._push_steps)
             force = np.where(is_pushed[:, None], self._push_force, 0.0)
@@ -261,7 +262,8 @@ class WalkTask(Task):
     @property
     def _walker(self) -> tuple[Any, ...]:
         """Parts of `kernels.Walker`."""
-        return self._walk_constants, self._plan_rows, self._bias, self._inertial, self._walk_columns
+        fixed = (self._walk_constants, self._plan_rows)
+        return (*fixed, self._bias, self._inertial, self._walk_columns)
 
     def _signals(self, joints: Records, worlds: Records) -> Signals:
         truth = worlds["truth"]
