@@ -132,8 +132,8 @@ def _episode_problems(evaluation: Evaluation) -> Iterator[str]:
             is_score = isinstance(value, float) and math.isfinite(value)
             if not record.get("termination") and not is_score:
                 yield (
-                    f"{column.metric} of episode {number} must be a finite number, it is"
-                    f" {quote(value)}"
+                    f"{column.metric} of episode {number} must be a finite number, it"
+                    f" is {quote(value)}"
                 )
         # an episode that ended early lacks later metrics: a robot that fell at once took no step
         missing = names - record.keys()

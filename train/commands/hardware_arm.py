@@ -126,8 +126,8 @@ def require_known_servos(settings: ArmSettings, model: mujoco.MjModel) -> None:
     for name, place in settings.joints.items():
         if name not in names:
             raise ConfigurationError(
-                f"the mounting names joint {name!r}, which the model does not have; it has"
-                f" {', '.join(names)}"
+                f"the mounting names joint {name!r}, which the model does not have; it"
+                f" has {', '.join(names)}"
             )
         if place.model is not None:
             model_number(place.model)

@@ -102,8 +102,8 @@ def _consent_question(setup: ArmSetup) -> str:
     nudges = f"move each joint by ±{options.nudge_rad:g} rad, away from a stop, then "
     return (
         f"The {len(setup.joints)} servos at {setup.settings.port} will"
-        f" {nudges if options.check else ''}follow the targets"
-        f" with up to {setup.settings.speed_rad_s:g} rad/s. Is the way free, and the power switch"
+        f" {nudges if options.check else ''}follow the targets with up to"
+        f" {setup.settings.speed_rad_s:g} rad/s. Is the way free, and the power switch"
         " in reach?"
     )
 

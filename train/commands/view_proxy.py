@@ -235,8 +235,8 @@ def open_listener(host: str = LOOPBACK, port: int = 0) -> socket.socket:
         family = socket.getaddrinfo(host or None, port, **kind)[0][0]
     except (socket.gaierror, UnicodeError):
         raise ConfigurationError(
-            f"--host must be an address or a name of this machine, such as {LOOPBACK}, got"
-            f" {quote(host)}"
+            f"--host must be an address or a name of this machine, such as {LOOPBACK},"
+            f" got {quote(host)}"
         ) from None
     problem = OSError()
     has_both = host == "::"
@@ -246,8 +246,8 @@ def open_listener(host: str = LOOPBACK, port: int = 0) -> socket.socket:
         except OSError as error:
             problem = error
     raise SystemFailedError(
-        f"the page cannot listen at {quote(host)}, port {port}: {problem.strerror}; name another"
-        " --port, or 0 for a free one"
+        f"the page cannot listen at {quote(host)}, port {port}: {problem.strerror};"
+        " name another --port, or 0 for a free one"
     ) from None
 
 

@@ -98,8 +98,8 @@ def require_run(folder: Path) -> Path:
             mode = path.lstat().st_mode
             if stat.S_ISLNK(mode) and leads_out(path, folder):
                 raise ConfigurationError(
-                    f"{path} is a link that leads out of {folder}, where nothing is to be changed;"
-                    " remove it"
+                    f"{path} is a link that leads out of {folder}, where nothing is to"
+                    " be changed; remove it"
                 )
             if not (stat.S_ISLNK(mode) or stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
                 problem = f"{path} is neither a file nor a folder, as all of a run are; remove it"
@@ -134,8 +134,8 @@ def require_name(name: str) -> str:
     """
     if name in ("", ".", "..") or any(sign in name for sign in "/\\\0"):
         raise ConfigurationError(
-            f"name must be the name of a folder in {RUNS}, without / and not . or .., got {name!r};"
-            " to write elsewhere, name a folder by --output"
+            f"name must be the name of a folder in {RUNS}, without / and not . or ..,"
+            f" got {name!r}; to write elsewhere, name a folder by --output"
         )
     return name
 
@@ -257,8 +257,8 @@ def _empty_folder(folder: Path) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     if names := sorted(path.name for path in folder.iterdir()):
         raise ResultsExistError(
-            f"{folder} already holds results ({', '.join(names[:3])}, ...), which are never"
-            " overwritten; name another folder, or leave --output out"
+            f"{folder} already holds results ({', '.join(names[:3])}, ...), which are"
+            " never overwritten; name another folder, or leave --output out"
         )
     return folder
 

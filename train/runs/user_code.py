@@ -26,13 +26,13 @@ from train.runs.import_path import append_to_path
 KINDS = {
     "comparison": (
         "elastic compare",
-        "references policies episodes scenario_episodes reference_scenarios figure_policies sweep"
-        " map groups leaderboard",
+        "references policies episodes scenario_episodes reference_scenarios"
+        " figure_policies sweep map groups leaderboard",
     ),
     "training": (
         "elastic train",
-        "weights base base_options settings algorithm algorithm_options anneal clip worlds"
-        " decisions seeds evaluate_every evaluation_episodes checkpoint_every",
+        "weights base base_options settings algorithm algorithm_options anneal clip"
+        " worlds decisions seeds evaluate_every evaluation_episodes checkpoint_every",
     ),
     "bench": ("elastic bench", "cases margin"),
 }

@@ -109,9 +109,9 @@ class ServoJoints:
         self._simulation.advance(steps)
         if not np.isfinite(self._simulation.qpos).all():
             raise ConfigurationError(
-                "the emulated joints diverge: a spring is too stiff for the inertia and the damping"
-                " that the joints file gives it; lower its stiffness, or raise its damping or"
-                " rotor_inertia"
+                "the emulated joints diverge: a spring is too stiff for the inertia and"
+                " the damping that the joints file gives it; lower its stiffness, or"
+                " raise its damping or rotor_inertia"
             )
 
 
@@ -130,8 +130,8 @@ class Joints(ServoJoints):
             raise ConfigurationError("an emulated joint needs a servo, got None")
         if joint.servo.motor is not None:
             raise ConfigurationError(
-                "an emulated servo controls its current, so that it has no motor; leave `motor` of"
-                " its servo out, or emulate an arm"
+                "an emulated servo controls its current, so that it has no motor; leave"
+                " `motor` of its servo out, or emulate an arm"
             )
         spec = elastic_spec(config.true_pendulum, joint, config.form, config.timestep_s)
         n = num_joints
@@ -180,8 +180,8 @@ class ArmJoints(ServoJoints):
         for name in arm.order:
             if name not in joints or joints[name].servo is None:
                 raise ConfigurationError(
-                    f"joint {name!r} cannot be emulated: it must be elastic and have a servo; the"
-                    f" elastic joints are {', '.join(joints)}"
+                    f"joint {name!r} cannot be emulated: it must be elastic and have a"
+                    f" servo; the elastic joints are {', '.join(joints)}"
                 )
         servos = [servo for name in arm.order if (servo := joints[name].servo) is not None]
         spec = config.robot.elastic(config)

@@ -122,8 +122,8 @@ class EmulatorConfig(Model):
             _ = model.table[name]
         if self.arm is not None and len(self.arm.order) != len(self.ids):
             raise ValueError(
-                f"an emulated arm needs one id for each of its joints, got {len(self.ids)} ids for"
-                f" {len(self.arm.order)} joints"
+                "an emulated arm needs one id for each of its joints, got"
+                f" {len(self.ids)} ids for {len(self.arm.order)} joints"
             )
         if not hasattr(termios, f"B{self.rate}"):
             raise ValueError(

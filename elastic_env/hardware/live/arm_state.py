@@ -79,8 +79,8 @@ def live_table(state: ArmState, joints: Sequence[str], counts: Counts, targets: 
         error = 1e3 * (state.link[i] - state.target[i])
         mark = " *" if state.is_limited[i] else ""
         lines.append(
-            f"{name:{width}} {state.target[i]:+8.4f} {state.link[i]:+8.4f} {error:+6.0f}"
-            f" {state.torque[i]:+6.2f} {state.temperature[i]:5.0f}{mark}"
+            f"{name:{width}} {state.target[i]:+8.4f} {state.link[i]:+8.4f}"
+            f" {error:+6.0f} {state.torque[i]:+6.2f} {state.temperature[i]:5.0f}{mark}"
         )
     lines.append(
         f"{state.time_s:.1f} s, target {targets.number}, {counts.cycles} cycles, {counts.late}"

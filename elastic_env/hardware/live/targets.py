@@ -176,6 +176,6 @@ def require_in_range(
         cure = "the angles look like degrees: convert them to radians"
     raise ConfigurationError(
         f"{source}: the target {rows[row, column]:g} rad of joint {joints[column]!r}"
-        f" (row {row + 1}) lies beyond its range of {lowest[column]:.4g} to {highest[column]:.4g}"
-        f" rad; {cure}"
+        f" (row {row + 1}) lies beyond its range of {lowest[column]:.4g} to"
+        f" {highest[column]:.4g} rad; {cure}"
     )

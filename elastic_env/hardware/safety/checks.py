@@ -35,8 +35,8 @@ _DELAY_CURE = (
     "and the bus to 1 Mbit/s or more"
 )
 _LINE_CURE = (
-    "a bad line: look at plugs, cable, ground and termination, and at what else keeps the computer "
-    "busy"
+    "a bad line: look at plugs, cable, ground and termination, and at what else keeps "
+    "the computer busy"
 )
 
 

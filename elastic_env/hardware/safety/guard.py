@@ -167,9 +167,9 @@ class Guard:
         behind = is_fresh & exceeds(distance, limits.following_error_rad)
         if behind.any():
             return (
-                f"a servo is further than {limits.following_error_rad:g} rad from its goal, "
-                f"blocked or overloaded: {self._list(behind, states.position)}, goal "
-                f"{np.round(self.goals[behind], 3).tolist()} rad"
+                f"a servo is further than {limits.following_error_rad:g} rad from its "
+                f"goal, blocked or overloaded: {self._list(behind, states.position)}, "
+                f"goal {np.round(self.goals[behind], 3).tolist()} rad"
             )
         return self._check_load(states) or self._check_heat(states.temperature)
 
