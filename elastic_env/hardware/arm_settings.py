@@ -64,7 +64,7 @@ class ArmSettings(Model):
     @field_validator("limits", mode="before")
     @classmethod
     def _add_default_limits(cls, limits: Any) -> Any:
-        return {**ARM_LIMITS.model_dump(), **limits} if isinstance(limits, dict) else limits
+        return ARM_LIMITS.model_dump() | limits if isinstance(limits, dict) else limits
 
     def _check(self) -> None:
         first: dict[int, str] = {}

@@ -59,7 +59,8 @@ class SafetyLimits(Model):
         Returns:
             The option that raises the limit, "" if it is already the most patient one.
         """
-        return "" if getattr(self, name) >= PATIENT_LIMITS[name] else "; for an emulator: --patient"
+        is_patient = getattr(self, name) >= PATIENT_LIMITS[name]
+        return "" if is_patient else "; for an emulator: --patient"
 
 
 class HardwareSettings(Model):
@@ -103,8 +104,8 @@ class HardwareSettings(Model):
     """Limits of goals, and of measurements that stop the motion."""
 
     def _check(self) -> None:
-        imu_port = self.imu_port
-        if imu_port is not None and os.path.realpath(imu_port) == os.path.realpath(self.port):
+        imu = self.imu_port
+        if imu is not None and os.path.realpath(imu) == os.path.realpath(self.port):
             raise ValueError(f"servo and IMU need a port of their own, got {self.port} twice")
         low, high = self._servo_range()
         if low < -_TURN or high > _TURN:

@@ -74,7 +74,8 @@ def unpack_evaluation(condition: Condition, key: str, content: bytes) -> Evaluat
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
         size = sum(part.file_size for part in archive.infolist())
     if size > MAX_BYTES:
-        raise UnfitCellError(f"unpacked it has {size} bytes, at most {MAX_BYTES} are read")
+        problem = f"unpacked it has {size} bytes, at most {MAX_BYTES} are read"
+        raise UnfitCellError(problem)
     with np.load(io.BytesIO(content), allow_pickle=False) as archive:
         arrays = dict(archive)
     if str(arrays.pop(_KEY, "")) != key:

@@ -153,7 +153,8 @@ class Run(Model):
             with run_folder("hardware", recorded, None, self.output) as folder:
                 steps = control_steps(env, policy, None)
                 metrics = _log_steps(steps, folder / "log.csv", console)
-                (folder / "metrics.json").write_text(f"{json.dumps(metrics, indent=2)}\n")
+                text = json.dumps(metrics, indent=2)
+                (folder / "metrics.json").write_text(f"{text}\n")
         console.print(f"Results in {folder}: log.csv (every step), metrics.json, config.yaml")
 
 

@@ -98,7 +98,8 @@ class ArmSetup:
         self.ranges = self.servos.servo_ranges(self.lowest, self.highest, self.settings.limits)
         self.links = self.compensator.constants.body
         tip = options.end_effector or outermost_body(model)
-        self.tip = EndEffector(model, self.joints, tip, held_positions(model, self.joints))
+        held = held_positions(model, self.joints)
+        self.tip = EndEffector(model, self.joints, tip, held)
 
     def tip_error(self, desired: Array, links: Array) -> float:
         """Distance of the tip at link angles from that at desired angles, rms over rows [m].
@@ -134,7 +135,7 @@ def require_known_servos(settings: ArmSettings, model: mujoco.MjModel) -> None:
 
 
 def typical_joints(settings: ArmSettings) -> dict[str, Any]:
-    """Settings of the joints by name: the name of each servo, which stands for its typical values.
+    """Settings of the joints by name: names of servos, which give typical values.
 
     Raises:
         ConfigurationError: A joint has no servo whose typical values are known.

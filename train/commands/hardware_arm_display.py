@@ -25,7 +25,7 @@ def rest_table(rests: Sequence[ArmState], joints: Sequence[str]) -> Table:
     rms = np.sqrt(np.mean(errors**2, axis=0))
     largest = np.abs(errors).max(axis=0)
     columns = zip(joints, rms, largest, strict=True)
-    rows = [[name, f"{low:.1f}", f"{high:.1f}"] for name, low, high in columns]
+    rows = [[name, f"{mean:.1f}", f"{most:.1f}"] for name, mean, most in columns]
     title = f"estimated link from its target at {len(errors)} poses [mrad]"
     return make_table(title, ["joint", "rms", "largest"], rows)
 

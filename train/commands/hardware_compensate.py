@@ -115,7 +115,8 @@ class LogPoses(ArmOptions):
             poses = self._poses(setup, start)
             return Poses(poses_from_both_sides(poses, self.apart_rad), self.hold_s)
 
-        folder, rests = move_arm(setup, Uncompensated(setup.compensator), make_targets, console)
+        compensator = Uncompensated(setup.compensator)
+        folder, rests = move_arm(setup, compensator, make_targets, console)
         path = write_rests(folder / "poses.csv", rests, setup.joints)
         console.print(f"  {path}")
 

@@ -24,13 +24,15 @@ from train.runs.escaping import write_records
 def scores_table(table: EpisodeTable, columns: Sequence[Column]) -> Table:
     """Return the mean of every policy in every cell, with intervals."""
     rows = []
-    for reference, scenario, policy in product(table.references, table.scenarios, table.policies):
+    places = product(table.references, table.scenarios, table.policies)
+    for reference, scenario, policy in places:
         for cell in table.cells_of(policy, reference, scenario):
             condition = table.conditions[policy, cell]
             episodes = table.rows_of(policy, cell)
             episodes = by_episode(episodes) if condition.member is None else episodes
             units = ([len(set(episodes["robot"]))], [condition.draws_robots])
-            scores = [count_episodes_apart(score(episodes, column), *units) for column in columns]
+            scores = [score(episodes, column) for column in columns]
+            scores = [count_episodes_apart(estimate, *units) for estimate in scores]
             figures = map(number_interval, scores, columns)
             over = next((estimate.over for estimate in scores if estimate.over), "-")
             values = condition.swept_values(table.swept)

@@ -39,7 +39,7 @@ _DESCRIPTION_FILES = {CONFIG, _METADATA, _LOCK}
 _RETRY_S = 0.2
 _HOLDER_CHARACTERS = 200
 """Longest text that is read from a lock file [characters]; it names the process."""
-_RECORDED_PACKAGES = "elastic-env mujoco gymnasium pin numpy scipy stable-baselines3 torch"
+_PACKAGES = "elastic-env mujoco gymnasium pin numpy scipy stable-baselines3 torch"
 """Packages whose versions a run records."""
 
 
@@ -70,7 +70,7 @@ def _write_metadata(folder: Path, content: dict[str, Any], results: list[str]) -
 
 
 def _recorded_results(folder: Path) -> list[str]:
-    """Return the names of recorded files in a folder, which may come from anybody."""
+    """Return the names of recorded files in a folder, which others may have made."""
     try:
         content = read_json(folder / _METADATA, LARGEST_JSON, missing=str)
     except ConfigurationError:
@@ -118,7 +118,7 @@ def create_folder(name: str, output: Path | None = None) -> Path:
         SystemFailedError: The folder cannot be made.
     """
     try:
-        return _numbered_folder(require_name(name)) if output is None else _empty_folder(output)
+        return _numbered_folder(name) if output is None else _empty_folder(output)
     except OSError as error:
         place = RUNS if output is None else output
         cause = f"{shorten(error.filename or place)}: {error.strerror or error}"
@@ -240,6 +240,7 @@ def _remove_without_result(folder: Path) -> Iterator[None]:
 
 def _numbered_folder(name: str) -> Path:
     """Make runs/<name>, or runs/<name>-<number>; `mkdir` succeeds for one program only."""
+    require_name(name)
     RUNS.mkdir(parents=True, exist_ok=True)
     for number in itertools.count(1):
         folder = RUNS / (name if number == 1 else f"{name}-{number}")
@@ -271,7 +272,7 @@ def provenance(seed: int | None) -> dict[str, Any]:
         "commit": _commit(),
         "python": platform.python_version(),
         "platform": platform.platform(),
-        "versions": {name: installed_version(name) for name in _RECORDED_PACKAGES.split()},
+        "versions": {name: installed_version(name) for name in _PACKAGES.split()},
     }
 
 

@@ -111,9 +111,9 @@ def run_calls(
 
     def submit(number: int) -> None:
         tries[number] += 1
-        settings = (Path.cwd(), everything(), pool.reporter)
+        context = (number, Path.cwd(), everything(), pool.reporter)
         try:
-            future = pool.submit(run_remote_call, function, arguments[number], number, *settings)
+            future = pool.submit(run_remote_call, function, arguments[number], *context)
         except RuntimeError as error:  # the pool was shut down
             raise ExecutorLostError(f"the workers are gone: {error}") from None
         futures[future] = number
@@ -129,7 +129,7 @@ def run_calls(
             raise outcome.error
         if isinstance(outcome.error, WorkerLostError):
             watch.tally.running.discard(number)
-            if interrupt.is_set():
+            if stop.is_set():
                 return
             if tries[number] <= MAX_RETRIES:
                 watch.on_move(number)
@@ -145,11 +145,11 @@ def run_calls(
             watch.tally.running.add(number)
         watch.on_report(number, value)
 
-    with _first_interrupt() if finishes else nullcontext(threading.Event()) as interrupt:
+    with _first_interrupt() if finishes else nullcontext(threading.Event()) as stop:
         for number in range(len(arguments)):
             submit(number)
         while futures:
-            if interrupt.is_set():
+            if stop.is_set():
                 cancel_waiting()
             with suppress(queue.Empty):
                 event = pool.events.get(timeout=_POLL_S)
@@ -170,7 +170,8 @@ def _outcome(future: Future[Any]) -> Outcome:
         return future.result()
     if type(error).__name__ == "KilledWorker":  # of dask, which moves calls itself
         return Outcome(error=WorkerKilledError())
-    return Outcome(error=error if isinstance(error, Exception) else CallFailedError(repr(error)))
+    is_exception = isinstance(error, Exception)
+    return Outcome(error=error if is_exception else CallFailedError(repr(error)))
 
 
 @contextmanager

@@ -134,7 +134,7 @@ class _Worker:
 
     def loss(self) -> Exception:
         """Return the error of a call that was lost with the process."""
-        # the exit code may come later than the end of the pipe
+        # the pipe ends before the exit code is known, or another thread is about to set it
         while (code := self.process.exitcode) is None:
             time.sleep(0.01)
         if self._has_begun or code < 0:

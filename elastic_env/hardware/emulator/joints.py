@@ -47,7 +47,7 @@ class ServoJoints:
         self._simulation = simulate(model, worlds, num_threads=1)
         self._at = JointAddresses.of(model, joints)
         self._world: IntArray = np.arange(n) * int(worlds > 1)
-        self._actuator = np.array([model.actuator(servo_name(name)).id for name in joints])
+        self._actuator = np.array([model.actuator(servo_name(j)).id for j in joints])
         self._force = self._simulation.bind("actuator_force")
         self._range = self._simulation.vary("actuator_forcerange")
         self._torque_limits = [servo.torque_limit for servo in servos]
@@ -163,7 +163,8 @@ class EmulatedArm(Model):
 class ArmJoints(ServoJoints):
     """An arm that rests until torque goes on for the first time.
 
-    Angles are those of the servos. A servo measures the torque of its duty cycle at rest.
+    Angles are those of the servos. A servo measures the torque that its duty cycle would give at
+    rest.
 
     Args:
         arm: The arm.
@@ -183,7 +184,7 @@ class ArmJoints(ServoJoints):
                     f"joint {name!r} cannot be emulated: it must be elastic and have a"
                     f" servo; the elastic joints are {', '.join(joints)}"
                 )
-        servos = [servo for name in arm.order if (servo := joints[name].servo) is not None]
+        servos = [s for name in arm.order if (s := joints[name].servo) is not None]
         spec = config.robot.elastic(config)
         spec.option.timestep = _ARM_STEP_S
         spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
@@ -207,7 +208,8 @@ class ArmJoints(ServoJoints):
 
     @override
     def command(self, index: int, angle: float) -> None:
-        super().command(index, float(self._direction[index] * (angle - self._zero[index])))
+        turn = angle - self._zero[index]
+        super().command(index, float(self._direction[index] * turn))
 
     @override
     def set_torque(self, index: int, share: float) -> None:

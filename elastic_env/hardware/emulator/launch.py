@@ -164,8 +164,8 @@ class RunningEmulator(AbstractContextManager["RunningEmulator"]):
     def events(self) -> list[tuple[float, int, str, int]]:
         """Switches, goals and requests for states since the last call.
 
-        Each is monotonic time [s], id, register and value [count]; `present_position` stands for a
-        request of states, with the true position.
+        Each is monotonic time [s], id, register and value [count]; `present_position` marks a
+        request of states, with the position in the reply.
         """
         return [tuple(event) for event in self._request({"events": True})]
 

@@ -139,7 +139,7 @@ class Emulator:
         is_idle = not self._replies and now >= self._settled_s
         for servo in self._servos:
             servo.watch(now)
-        has_instruction = self.bus_terminal is not None and self.bus_terminal.master in ready
+        has_instruction = any(source != control for source in ready)
         if has_instruction:
             now = self.answer_instructions()
         # after the answers, which are urgent

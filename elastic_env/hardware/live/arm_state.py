@@ -67,7 +67,8 @@ def state_message(state: ArmState, joints: Sequence[str]) -> dict[str, object]:
         return {name: float(value) if math.isfinite(value) else None for name, value in pairs}
 
     signals = ("theta", "link", "torque", "temperature")
-    return {"time_s": state.time_s, **{name: by_joint(getattr(state, name)) for name in signals}}
+    values = {name: by_joint(getattr(state, name)) for name in signals}
+    return {"time_s": state.time_s, **values}
 
 
 def live_table(state: ArmState, joints: Sequence[str], counts: Counts, targets: Targets) -> str:

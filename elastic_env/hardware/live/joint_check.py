@@ -54,7 +54,7 @@ def check_joint(arm: Arm, joint: int, way_rad: float) -> JointCheck:
     load.
 
     Args:
-        arm: Under torque.
+        arm: Arm under torque.
         joint: Index of the joint.
         way_rad: Move to either side [rad].
 
@@ -108,8 +108,8 @@ def require_signs(
     expected = gravity_torque(theta)
     measured = np.array([check.torque for check in checks])
     loads = zip(servos.joints, expected.tolist(), strict=True)
-    bounds = np.array([friction_torque_bound(settings[name], load) for name, load in loads])
-    wrong = wrong_sign(measured, theta, gravity_torque, bounds)
+    bounds = [friction_torque_bound(settings[name], load) for name, load in loads]
+    wrong = wrong_sign(measured, theta, gravity_torque, np.array(bounds))
     if wrong is not None:
         raise HardwareError(
             f"joint {servos.joints[wrong]!r} holds {measured[wrong]:+.2f} N·m where the model says"
