@@ -62,8 +62,8 @@ class PlausibleAttitudes:
 
     An IMU marks the result of its filter as valid, right or not. A filter that has stopped goes on
     sending its last angles. Angles of a working filter should not be equal in all bits: a gyroscope
-    of some 0.005 °/s/√Hz changes an angle by about 10 µrad from packet to packet at 100 Hz, and a
-    bit is at most 0.24 µrad. So three unchanged angles are as old as their first packet, and
+    of some 0.005 °/s/√Hz changes an angle by about 10 µrad from packet to packet at 100 Hz. A bit
+    is at most 0.24 µrad. So three unchanged angles are as old as their first packet, and
     count as missing at the same age as any attitude.
 
     Args:

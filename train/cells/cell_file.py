@@ -102,16 +102,14 @@ def unpack_evaluation(condition: Condition, key: str, content: bytes) -> Evaluat
 def _arrays_under(group: str, arrays: Arrays) -> Arrays:
     """Return the arrays whose names begin with a group, without that prefix."""
     prefix = f"{group}/"
-    keys = [key for key in arrays if key.startswith(prefix)]
-    return {key.removeprefix(prefix): arrays[key] for key in keys}
+    return {k[len(prefix) :]: a for k, a in arrays.items() if k.startswith(prefix)}
 
 
 def _episode_problems(evaluation: Evaluation) -> Iterator[str]:
     """Yield why records do not fit the condition: all of them, in order, with finite scores."""
     condition = evaluation.condition
     episodes = evaluation.episodes
-    are_records = isinstance(episodes, list) and {*map(type, episodes)} <= {dict}
-    if not are_records:
+    if not (isinstance(episodes, list) and {*map(type, episodes)} <= {dict}):
         yield "it has no episodes"
         return
     if len(episodes) != condition.episodes:

@@ -73,9 +73,7 @@ class ArmSetup:
             limits = self.settings.limits.replace(**PATIENT_LIMITS)
             self.settings = self.settings.replace(limits=limits)
         require_known_servos(self.settings, model)
-        self.mapping: dict[str, Any] = (
-            typical_joints(self.settings) if joints is None else dict(read_mapping(joints))
-        )
+        self.mapping = dict(read_mapping(joints)) if joints else typical_joints(self.settings)
         """Settings of the joints by name, as in a file of joints."""
         self.compensator = PositionCompensator.from_model(
             model,

@@ -257,8 +257,8 @@ def read_leaderboard(path: Path) -> list[Standing]:
         try:
             standings = [_standing(row) for row in csv.DictReader(file)]
         except ValidationError as error:
-            problem = error.errors()[0]["msg"]
-            raise ConfigurationError(f"{shorten(path)} is no leaderboard.csv: {problem}") from None
+            problem = f"{shorten(path)} is no leaderboard.csv: {error.errors()[0]['msg']}"
+            raise ConfigurationError(problem) from None
         except (KeyError, TypeError, ValueError, csv.Error) as error:
             problem = f"{shorten(path)} is no leaderboard.csv: {error!r}"
             raise ConfigurationError(problem) from None

@@ -116,7 +116,7 @@ class Results:
         others = [row for row in self.judged_changes if not row.is_rival]
         bases = {(row.policy, row.place, row.column): row for row in others[::-1]}
         shown = [row for row in rivals if row.is_group]
-        if not shown and len({(row.policy, row.place) for row in rivals}) <= _MAX_CLAIMS:
+        if not shown and len({(r.policy, r.place) for r in rivals}) <= _MAX_CLAIMS:
             shown = rivals
         return [(row, bases[row.policy, row.place, row.column]) for row in shown]
 
@@ -139,7 +139,7 @@ def sentences(kind: Literal["headline", "in_short", "notes"], results: Results) 
         "failures": failures,
         "ranked": _rank_policies,
         "by_metric": lambda rows: group_by(rows, lambda row: row.column).values(),
-        "marks": [kind for kind in kinds if any(mark.startswith(kind) for mark in marks)],
+        "marks": [kind for kind in kinds if any(m.startswith(kind) for m in marks)],
         "verdict_words": _VERDICTS,
     }
     text = getattr(load_template("sentences.j2").make_module(helpers), kind)(results)

@@ -61,10 +61,9 @@ def summary_table(
     for e in evaluations:
         condition = e.condition
         names = [condition.reference_name, condition.scenario, condition.policy.title]
-        values = condition.swept_values(swept)
         figures = [_figure(e, column, worst, intervals) for column in columns]
         failed = f"{e.num_failed}/{len(e.episodes)}"
-        rows.append(Row((*names, *values, *figures, failed)))
+        rows.append(Row((*names, *condition.swept_values(swept), *figures, failed)))
     title = f"{environment.subject}, median over episodes"
     title += _interval_label(evaluations) if intervals else ""
     return Table(tuple(heads), tuple(rows), keys=3, title=title, caption=environment.note)
@@ -134,10 +133,9 @@ def _parts(evaluations: Sequence[Evaluation]) -> list[str]:
     interval = _interval_label(evaluations)
     worst = f"{interval} (the worst of them)" if interval else ""
     statistic = f"Median over the episodes that did not fail{worst}"
-    legend = [*column_notes(environment.columns), environment.note]
     parts = [
         f"{capital(environment.subject)}. {statistic}; failures are counted separately.",
-        " ".join(filter(None, legend)),
+        " ".join(filter(None, [*column_notes(environment.columns), environment.note])),
         to_markdown(summary_table(evaluations, environment.columns, worst=True)),
     ]
     for title, columns in environment.splits.items():

@@ -58,8 +58,7 @@ def write_csv(head: Sequence[str], rows: Iterable[Iterable[Any]], path: Path) ->
 def write_records(records: Sequence[Mapping[str, Any]], path: Path) -> Path:
     """Write a CSV file of rows by column name; columns that a row lacks are empty."""
     head = list(dict.fromkeys(name for record in records for name in record))
-    rows = [[record.get(name, "") for name in head] for record in records]
-    return write_csv(head, rows, path)
+    return write_csv(head, [[r.get(name, "") for name in head] for r in records], path)
 
 
 def markdown_text(text: str) -> str:

@@ -79,5 +79,4 @@ def first_sentence(file: Path) -> str:
 
 def _presets_of_kind(kind: str) -> dict[str, Path]:
     """Return the presets of a kind, by name."""
-    files = presets().items()
-    return {name: file for name, file in files if kind_of(read_mapping(file)) == kind}
+    return {n: f for n, f in presets().items() if kind_of(read_mapping(f)) == kind}

@@ -110,8 +110,7 @@ def show_progress(
         progress.TextColumn("{task.fields[note]}", markup=False),
     )
     with progress.Progress(*columns, console=console, transient=transient) as bar:
-        begun = {"start": False, "note": ""}
-        tasks = [bar.add_task(name, total=totals[name], **begun) for name in totals]
+        tasks = [bar.add_task(n, start=False, total=totals[n], note="") for n in totals]
 
         def draw(number: int, amount: int, note: str = "") -> None:
             bar.start_task(tasks[number])

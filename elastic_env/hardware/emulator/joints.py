@@ -175,8 +175,7 @@ class ArmJoints(ServoJoints):
     """
 
     def __init__(self, arm: EmulatedArm, start_s: float) -> None:
-        home = arm.home or None
-        config = configure_robot(arm.model, arm.joints, "hold", home=home)
+        config = configure_robot(arm.model, arm.joints, "hold", home=arm.home or None)
         joints: dict[str, ElasticJoint] = config.true_joints
         for name in arm.order:
             if name not in joints or joints[name].servo is None:

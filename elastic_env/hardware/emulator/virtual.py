@@ -141,9 +141,8 @@ class VirtualBus(AbstractContextManager["VirtualBus"]):
 
     def enable(self, limits: SafetyLimits, ranges: Array) -> Array:
         """Switch torque on, see `SupervisedBus.enable`."""
-        ends = ranges.tolist()
-        answer = self._request("enable", limits=limits.model_dump(), ranges=ends)
-        return np.array(answer["position"])
+        arguments = {"limits": limits.model_dump(), "ranges": ranges.tolist()}
+        return np.array(self._request("enable", **arguments)["position"])
 
     def exchange(self, goals: Array, at: float) -> Cycle:
         """Run one control cycle, see `SupervisedBus.exchange`."""

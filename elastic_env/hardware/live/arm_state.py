@@ -101,11 +101,7 @@ class ArmLog:
 
     def __init__(self, file: TextIO, joints: Sequence[str]) -> None:
         self._writer = csv.writer(file, lineterminator="\n")
-        columns = [
-            f"{signal}.{joint} [{_UNITS.get(signal, 'rad')}]"
-            for signal in _LOGGED
-            for joint in joints
-        ]
+        columns = [f"{name}.{j} [{_UNITS.get(name, 'rad')}]" for name in _LOGGED for j in joints]
         self._writer.writerow(["time [s]", *columns, "late [s]", "held [1]", "target [1]"])
 
     def write(self, state: ArmState, number: int) -> None:

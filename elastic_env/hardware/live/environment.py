@@ -65,8 +65,7 @@ class HardwareTestbedTask(JointTask):
     def __init__(self, config: TestbedConfig, settings: HardwareSettings) -> None:
         # the IMU is read in every cycle
         period_s = config.control_period_s
-        imu = AttitudeSensor(rate_hz=1.0 / period_s)
-        scenario = config.scenario.replace(imu=imu)
+        scenario = config.scenario.replace(imu=AttitudeSensor(rate_hz=1.0 / period_s))
         super().__init__(config.replace(scenario=scenario), num_worlds=1)
         self.metrics = (*METRICS_OF_ONE, *TIMING_METRICS)
         at = JointAddresses.of(self.model, self.assumed_model.joint_names)
@@ -109,8 +108,7 @@ class HardwareTestbedTask(JointTask):
 
     def _signals(self, joints: Records, worlds: Records) -> Signals:
         """Signals of a step, with those of its cycle."""
-        cycle = worlds["cycle"]
-        timing = {name: cycle[name].copy() for name in _CYCLE.names or ()}
+        timing = {name: worlds["cycle"][name].copy() for name in _CYCLE.names or ()}
         return {**super()._signals(joints, worlds), **timing}
 
     @property

@@ -77,12 +77,11 @@ def check_joint(arm: Arm, joint: int, way_rad: float) -> JointCheck:
         )
     command, theta, torque = 0.5 * (far + near)
     sag = command - theta
-    gain = torque / sag if abs(sag) > _LEAST_SAG_RAD else np.nan
     return JointCheck(
         first_move=off_stops + side,
         follow_ratio=follow_ratio,
         torque=float(torque),
-        gain=float(gain),
+        gain=float(torque / sag if abs(sag) > _LEAST_SAG_RAD else np.nan),
         theta=0.5 * (theta_far + theta_near),
     )
 

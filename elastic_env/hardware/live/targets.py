@@ -146,8 +146,7 @@ def read_targets(
 
 def _joint_name(column: str) -> str:
     """Joint of a column; logs of poses have columns such as `theta.elbow [rad]`."""
-    name = column.partition("[")[0].strip()
-    return name.removeprefix("theta.").removeprefix("q.")
+    return column.partition("[")[0].strip().removeprefix("theta.").removeprefix("q.")
 
 
 def require_in_range(

@@ -176,8 +176,7 @@ class Guard:
     def _check_load(self, states: States) -> str:
         """Reason to stop by the torques, "" if there is none."""
         torque = np.abs(states.torque)
-        is_strained = exceeds(torque, self._strongest)
-        strained = np.where(is_strained, self._strained + 1, 0)
+        strained = np.where(exceeds(torque, self._strongest), self._strained + 1, 0)
         # a missing reply changes no count
         self._strained = np.where(states.is_fresh, strained, self._strained)
         too_long = states.is_fresh & (self._strained >= self.limits.patience_cycles)
