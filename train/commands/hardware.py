@@ -172,7 +172,7 @@ _COLUMNS = (
 
 
 def _log_steps(steps: Iterable[ControlStep], path: Path, console: Console) -> dict[str, Any]:
-    """Write every step, whatever ends the episode, and print a line once a second.
+    """Write every step, also of an episode cut short, and print a line once a second.
 
     Returns:
         Metrics of the episode.

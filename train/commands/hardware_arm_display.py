@@ -24,7 +24,7 @@ def rest_table(rests: Sequence[ArmState], joints: Sequence[str]) -> Table:
     errors = 1e3 * np.array([state.link - state.target for state in rests])
     rms = np.sqrt(np.mean(errors**2, axis=0))
     columns = zip(joints, rms, np.abs(errors).max(axis=0), strict=True)
-    rows = [[name, f"{mean:.1f}", f"{most:.1f}"] for name, mean, most in columns]
+    rows = [[name, f"{error:.1f}", f"{most:.1f}"] for name, error, most in columns]
     title = f"estimated link from its target at {len(errors)} poses [mrad]"
     return make_table(title, ["joint", "rms", "largest"], rows)
 

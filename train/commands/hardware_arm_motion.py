@@ -117,7 +117,7 @@ def _follow_targets(
     console: Console,
     simulation: VirtualBus | None,
 ) -> dict[int, ArmState]:
-    """Follow the targets and go back; write logs and summary, whatever ends the motion."""
+    """Follow the targets and go back; write the logs, also of an interrupted motion."""
     rests: dict[int, ArmState] = {}
     true_links: dict[int, Array] = {}
     is_interrupted = False
