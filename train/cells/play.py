@@ -80,11 +80,8 @@ def run_conditions(
     new = iter(_BatchRun(missing, console, place, store).outcomes() if missing else [])
     outcomes = [next(new) if cell is None else Outcome(cell) for cell in stored]
     finished = [o.value for o in outcomes if o and o.error is None]
-    failures = dict(
-        _explain_failure(condition, outcome)
-        for condition, outcome in zip(conditions, outcomes, strict=True)
-        if outcome is not None and outcome.error is not None
-    )
+    pairs = zip(conditions, outcomes, strict=True)
+    failures = dict(_failure(c, o) for c, o in pairs if o and o.error is not None)
     if failures:
         raise CellsFailedError(failures, finished)
     if None in outcomes:
@@ -219,7 +216,7 @@ def make_batches(conditions: Sequence[Condition], cores: int) -> list[list[int]]
     return batches
 
 
-def _explain_failure(condition: Condition, outcome: Outcome) -> tuple[str, int]:
+def _failure(condition: Condition, outcome: Outcome) -> tuple[str, int]:
     """Return message and exit code of a failure; the message of a defect has its traceback."""
     error = outcome.error
     assert error is not None

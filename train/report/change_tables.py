@@ -105,8 +105,7 @@ def changes_table(rows: Sequence[Change], colours: Mapping[str, str]) -> Table:
             cells += [*row.first.swept_values(swept), row.column.title, _means(row)]
             cells += [(Part(percent_interval(row.relative), row.verdict),)]
             cells += [percent_interval(row.improvement, signed=False)]
-            cells += [row.relative.over or "-", (failed,)]
-            cells += [row.sentence] if is_family else []
+            cells += [row.relative.over or "-", (failed,), *[row.sentence] * is_family]
             lines.append(Row(tuple(cells), kind="group" if row.is_group else ""))
     return Table(tuple(heads), tuple(lines), keys=3 + len(swept), kind="changes")
 

@@ -63,10 +63,8 @@ def robots_table(cells: Sequence[RobotScores]) -> Table:
     for row in cells:
         names = (row.reference, row.scope, row.policy, row.column.label)
         scores = [number_interval(estimate, row.column) for estimate in row.scores]
-        better = [
-            f"{title}: {percent_interval(share, signed=False)}"
-            for title, share in row.better.items()
-        ]
+        shares = row.better.items()
+        better = [f"{k}: {percent_interval(v, signed=False)}" for k, v in shares]
         others = "; ".join(better) or "-"
         failed = f"{row.failed}/{row.episodes}"
         rows.append(Row((*names, *scores, failed, row.mean.over or "-", others)))
@@ -91,9 +89,7 @@ def print_robots(cells: Sequence[RobotScores], console: Console) -> None:
         for policy, metrics in group_by(group, lambda row: row.policy).items():
             figures = {row.column: row.scores for row in metrics}
             failed = f"{metrics[0].failed}/{metrics[0].episodes}"
-            texts = (
-                number_interval(score, column) for column in columns for score in figures[column]
-            )
+            texts = (number_interval(score, c) for c in columns for score in figures[c])
             rows.append(Row((policy, *texts, failed)))
     number = max(row.mean.robots for row in cells)
     title = f"means over up to {number} drawn robots, those that did not fail [95 % interval]"

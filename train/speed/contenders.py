@@ -155,11 +155,11 @@ class RawWorlds(Contender):
 
     @override
     def run(self, steps: int) -> float:
-        controls = self._loop.controls
+        controls = itertools.repeat(self._loop.controls)
         numbers = range(len(self._data))
         with ThreadPoolExecutor(len(numbers)) as threads:
             begin = time.perf_counter()
-            list(threads.map(self._play, numbers, itertools.repeat(controls)))
+            list(threads.map(self._play, numbers, controls))
         return self.num_envs * steps / (time.perf_counter() - begin)
 
     @override
