@@ -71,14 +71,14 @@ def cells_table(rows: Sequence[Change]) -> Table:
         figures = [signed_interval(row.relative, row.verdict) for row in line]
         cells = (*labels, *first.first.swept_values(swept), *figures, _failures(first))
         lines.append(Row(cells, "group" if first.is_group else ""))
-    signs = _signs([mark for row in rows for mark in row.marks])
+    used = _signs([mark for row in rows for mark in row.marks])
     return Table(
         tuple(heads),
         tuple(lines),
         keys=len(names),
         title=f"change against {_opponent(rows)} on the same episodes, {_statistic(rows)}",
         subjects=policies if is_one else (),
-        caption=". ".join([*(f"{s} {_SIGNS[s]}" for s in signs), change_text.SIGNS_ARE]),
+        caption=". ".join([*(f"{s} {_SIGNS[s]}" for s in used), change_text.SIGNS_ARE]),
     )
 
 

@@ -29,7 +29,8 @@ def scores_table(table: EpisodeTable, columns: Sequence[Column]) -> Table:
         for cell in table.cells_of(policy, reference, scenario):
             condition = table.conditions[policy, cell]
             episodes = table.rows_of(policy, cell)
-            episodes = episodes_as_robots(episodes) if condition.member is None else episodes
+            if condition.member is None:
+                episodes = episodes_as_robots(episodes)
             units = ([len(set(episodes["robot"]))], [condition.draws_robots])
             scores = [score(episodes, column) for column in columns]
             scores = [count_episodes_apart(estimate, *units) for estimate in scores]
