@@ -64,15 +64,15 @@ class ArmSettings(Model):
     @field_validator("limits", mode="before")
     @classmethod
     def _add_default_limits(cls, limits: Any) -> Any:
-        return {**ARM_LIMITS.model_dump(), **limits} if isinstance(limits, dict) else limits
+        return ARM_LIMITS.model_dump() | limits if isinstance(limits, dict) else limits
 
     def _check(self) -> None:
         first: dict[int, str] = {}
         for name, place in self.joints.items():
             if place.id in first:
                 raise ValueError(
-                    f"joints {first[place.id]} and {name} both have the id {place.id}; every servo"
-                    " needs an id of its own"
+                    f"joints {first[place.id]} and {name} both have the id {place.id};"
+                    " every servo needs an id of its own"
                 )
             first[place.id] = name
 
@@ -85,9 +85,9 @@ class ArmSettings(Model):
         for name in joints:
             if name not in self.joints:
                 raise ConfigurationError(
-                    f"joint {name!r} has no servo: give its id under `joints` of the mounting, or"
-                    f" write {name}: held in the file of joints; there are ids of"
-                    f" {', '.join(self.joints)}"
+                    f"joint {name!r} has no servo: give its id under `joints` of the"
+                    f" mounting, or write {name}: held in the file of joints; there are"
+                    f" ids of {', '.join(self.joints)}"
                 )
         return ServoMap(tuple(joints), [self.joints[name] for name in joints])
 

@@ -62,9 +62,9 @@ class PlausibleAttitudes:
 
     An IMU marks the result of its filter as valid, right or not. A filter that has stopped goes on
     sending its last angles. Angles of a working filter should not be equal in all bits: a gyroscope
-    of some 0.005 °/s/√Hz changes an angle by about 10 µrad from packet to packet at 100 Hz, and a
-    bit is at most 0.24 µrad. So three equal angles are as old as their first packet, and count as
-    missing at the same age as any attitude.
+    of some 0.005 °/s/√Hz changes an angle by about 10 µrad from packet to packet at 100 Hz. A bit
+    is at most 0.24 µrad. So three unchanged angles are as old as their first packet, and
+    count as missing at the same age as any attitude.
 
     Args:
         oldest_s: Age at which an attitude counts as missing [s].
@@ -85,9 +85,9 @@ class PlausibleAttitudes:
             angle = getattr(sample, name)
             if is_outside(angle, -end - _ROUNDING_RAD, end + _ROUNDING_RAD):
                 return (
-                    f"sends {name} = {angle:g} rad and calls it valid; it must lie between "
-                    f"{-end:.4f} and {end:.4f} rad: switch the IMU off and on, and look at the "
-                    "settings of its filter"
+                    f"sends {name} = {angle:g} rad and calls it valid; it must lie "
+                    f"between {-end:.4f} and {end:.4f} rad: switch the IMU off and on, "
+                    "and look at the settings of its filter"
                 )
         if self._first is None or astuple(sample)[1:] != astuple(self._first)[1:]:
             self._first = sample
@@ -95,8 +95,8 @@ class PlausibleAttitudes:
         if is_outside(same_s, 0.0, self._oldest_s):
             return (
                 f"has sent the same attitude in all bits for {1e3 * same_s:.0f} ms, "
-                f"{1e3 * self._oldest_s:.0f} ms are allowed (imu_oldest_s): its filter stands "
-                "still; switch the IMU off and on"
+                f"{1e3 * self._oldest_s:.0f} ms are allowed (imu_oldest_s): its filter "
+                "stands still; switch the IMU off and on"
             )
         return ""
 

@@ -46,8 +46,8 @@ class SafetyLimits(Model):
     def _check(self) -> None:
         if self.highest_rad - self.lowest_rad < _LEAST_RANGE_RAD:
             raise ValueError(
-                f"lowest_rad must be below highest_rad, by at least {_LEAST_RANGE_RAD} rad, got"
-                f" {self.lowest_rad} and {self.highest_rad}"
+                f"lowest_rad must be below highest_rad, by at least {_LEAST_RANGE_RAD}"
+                f" rad, got {self.lowest_rad} and {self.highest_rad}"
             )
 
     def patience_hint(self, name: str) -> str:
@@ -59,7 +59,8 @@ class SafetyLimits(Model):
         Returns:
             The option that raises the limit, "" if it is already the most patient one.
         """
-        return "" if getattr(self, name) >= PATIENT_LIMITS[name] else "; for an emulator: --patient"
+        is_patient = getattr(self, name) >= PATIENT_LIMITS[name]
+        return "" if is_patient else "; for an emulator: --patient"
 
 
 class HardwareSettings(Model):
@@ -103,16 +104,16 @@ class HardwareSettings(Model):
     """Limits of goals, and of measurements that stop the motion."""
 
     def _check(self) -> None:
-        imu_port = self.imu_port
-        if imu_port is not None and os.path.realpath(imu_port) == os.path.realpath(self.port):
+        imu = self.imu_port
+        if imu is not None and os.path.realpath(imu) == os.path.realpath(self.port):
             raise ValueError(f"servo and IMU need a port of their own, got {self.port} twice")
         low, high = self._servo_range()
         if low < -_TURN or high > _TURN:
             limits = self.limits
             raise ValueError(
-                f"lowest_rad {limits.lowest_rad:g} and highest_rad {limits.highest_rad:g} with"
-                f" zero_rad {self.zero_rad:g} are {low:.2f} to {high:.2f} rad of the servo, which"
-                f" has ±{_TURN:.2f}"
+                f"lowest_rad {limits.lowest_rad:g} and highest_rad"
+                f" {limits.highest_rad:g} with zero_rad {self.zero_rad:g} are {low:.2f}"
+                f" to {high:.2f} rad of the servo, which has ±{_TURN:.2f}"
             )
 
     def servo_angle(self, joint: float) -> float:

@@ -74,7 +74,8 @@ def unpack_evaluation(condition: Condition, key: str, content: bytes) -> Evaluat
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
         size = sum(part.file_size for part in archive.infolist())
     if size > MAX_BYTES:
-        raise UnfitCellError(f"unpacked it has {size} bytes, at most {MAX_BYTES} are read")
+        problem = f"unpacked it has {size} bytes, at most {MAX_BYTES} are read"
+        raise UnfitCellError(problem)
     with np.load(io.BytesIO(content), allow_pickle=False) as archive:
         arrays = dict(archive)
     if str(arrays.pop(_KEY, "")) != key:
@@ -101,16 +102,14 @@ def unpack_evaluation(condition: Condition, key: str, content: bytes) -> Evaluat
 def _arrays_under(group: str, arrays: Arrays) -> Arrays:
     """Return the arrays whose names begin with a group, without that prefix."""
     prefix = f"{group}/"
-    keys = [key for key in arrays if key.startswith(prefix)]
-    return {key.removeprefix(prefix): arrays[key] for key in keys}
+    return {k[len(prefix) :]: a for k, a in arrays.items() if k.startswith(prefix)}
 
 
 def _episode_problems(evaluation: Evaluation) -> Iterator[str]:
     """Yield why records do not fit the condition: all of them, in order, with finite scores."""
     condition = evaluation.condition
     episodes = evaluation.episodes
-    are_records = isinstance(episodes, list) and {*map(type, episodes)} <= {dict}
-    if not are_records:
+    if not (isinstance(episodes, list) and {*map(type, episodes)} <= {dict}):
         yield "it has no episodes"
         return
     if len(episodes) != condition.episodes:
@@ -132,8 +131,8 @@ def _episode_problems(evaluation: Evaluation) -> Iterator[str]:
             is_score = isinstance(value, float) and math.isfinite(value)
             if not record.get("termination") and not is_score:
                 yield (
-                    f"{column.metric} of episode {number} must be a finite number, it is"
-                    f" {quote(value)}"
+                    f"{column.metric} of episode {number} must be a finite number, it"
+                    f" is {quote(value)}"
                 )
         # an episode that ended early lacks later metrics: a robot that fell at once took no step
         missing = names - record.keys()

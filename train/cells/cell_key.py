@@ -30,14 +30,14 @@ _MAX_SOURCE_BYTES = 10_000_000
 def cell_key(condition: Condition) -> str:
     """Return the SHA-256 digest of a condition, its files, and the versions of the physics.
 
-    Files are weights of residuals, tables of offsets and stiffness, robots with their models and
-    joints, and the user's Python files with the files of their folder that they import. They are
-    read and never imported. Files that such code reads when it runs are not noticed. Labels are
-    text and name no files.
+    Files are weights of residuals, tables of offsets and stiffness, and robots with their models
+    and joints. Python files of the user count too, with the files of their folder that they import.
+    They are read and never imported. Files that such code reads when it runs are not noticed.
+    Labels are text and name no files.
     """
     relevant = condition.model_dump(mode="json", exclude=_IRRELEVANT_FIELDS)  # type: ignore[arg-type]
-    unlabelled = condition.model_dump(mode="json", exclude=_LABELS)  # type: ignore[arg-type]
-    files = [file for text in _texts(unlabelled) for file in named_files(text)]
+    named = condition.model_dump(mode="json", exclude=_LABELS)  # type: ignore[arg-type]
+    files = [file for text in _texts(named) for file in named_files(text)]
     digests = {str(file): digest_of(file) for file in files}
     content = {"condition": relevant, "files": digests, "versions": physics()}
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()

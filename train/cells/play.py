@@ -77,14 +77,11 @@ def run_conditions(
     if len(missing) < len(conditions):
         number = len(conditions) - len(missing)
         console.print(f"{number} of {len(conditions)} cells are kept")
-    played = iter(_BatchRun(missing, console, place, store).outcomes() if missing else [])
-    outcomes = [next(played) if cell is None else Outcome(cell) for cell in stored]
-    finished = [outcome.value for outcome in outcomes if outcome and outcome.error is None]
-    failures = dict(
-        _explain_failure(condition, outcome)
-        for condition, outcome in zip(conditions, outcomes, strict=True)
-        if outcome is not None and outcome.error is not None
-    )
+    new = iter(_BatchRun(missing, console, place, store).outcomes() if missing else [])
+    outcomes = [next(new) if cell is None else Outcome(cell) for cell in stored]
+    finished = [o.value for o in outcomes if o and o.error is None]
+    pairs = zip(conditions, outcomes, strict=True)
+    failures = dict(_failure(c, o) for c, o in pairs if o and o.error is not None)
     if failures:
         raise CellsFailedError(failures, finished)
     if None in outcomes:
@@ -130,7 +127,8 @@ class _BatchRun:
         def length(batch: list[int]) -> int:
             return sum(steps[i] for i in batch)
 
-        self._batches = sorted(make_batches(conditions, cores), key=length, reverse=True)
+        batches = make_batches(conditions, cores)
+        self._batches = sorted(batches, key=length, reverse=True)
         self._steps = list(map(length, self._batches))
         self._cells = [[conditions[i] for i in batch] for batch in self._batches]
         self._keys = [] if self.store is None else list(map(cell_key, conditions))
@@ -148,7 +146,8 @@ class _BatchRun:
             if len(self._batches) == 1 and self.place.is_local:
                 # in this process, since another one takes seconds to start
                 report = partial(self._report, 0)
-                self._end(0, Outcome(_evaluate(self._cells[0], report, self.place.jobs)))
+                outcomes = _evaluate(self._cells[0], report, self.place.jobs)
+                self._end(0, Outcome(outcomes))
             else:
                 self._play_in_workers()
         return self._outcomes
@@ -205,7 +204,8 @@ def make_batches(conditions: Sequence[Condition], cores: int) -> list[list[int]]
             batches.append([number])
             continue
         policy = (condition.policy, condition.member, condition.policy_options)
-        key = repr((policy, condition.reference_name, rollout.shared_settings(condition)))
+        settings = rollout.shared_settings(condition)
+        key = repr((policy, condition.reference_name, settings))
         batch, size = open_batch.get(key, ([], max_size))
         if size + condition.episodes > max_size:
             batch = []
@@ -216,7 +216,7 @@ def make_batches(conditions: Sequence[Condition], cores: int) -> list[list[int]]
     return batches
 
 
-def _explain_failure(condition: Condition, outcome: Outcome) -> tuple[str, int]:
+def _failure(condition: Condition, outcome: Outcome) -> tuple[str, int]:
     """Return message and exit code of a failure; the message of a defect has its traceback."""
     error = outcome.error
     assert error is not None
@@ -235,10 +235,10 @@ def _cell_name(condition: Condition) -> str:
     return f"{name}{swept}" if seed is None else f"{name}{swept}, training seed {seed}"
 
 
-def _play_on_hardware(condition: Condition, position: str, console: Console) -> Evaluation:
+def _play_on_hardware(condition: Condition, turn: str, console: Console) -> Evaluation:
     (total,) = rollout.num_steps([condition])
     show = plain_progress(console)
-    console.print(f"{position}: {condition.policy.title} plays {condition.reference_name}")
+    console.print(f"{turn}: {condition.policy.title} plays {condition.reference_name}")
     return evaluate(condition, _step_counter(lambda done: show(done / total)))
 
 
@@ -255,10 +255,10 @@ def _step_counter(report: Callable[[int], None]) -> Callable[[int], None]:
 
 
 def _evaluate_in_worker(
-    conditions: Sequence[Condition], shown: frozenset[str], report: Callable[[int], None]
+    conditions: Sequence[Condition], seen: frozenset[str], report: Callable[[int], None]
 ) -> list[Outcome]:
     """Evaluate conditions in a worker, without repeating warnings that were shown before."""
-    with warn_once(shown):
+    with warn_once(seen):
         return _evaluate(conditions, report)
 
 

@@ -5,7 +5,8 @@ from pathlib import Path
 
 from elastic_env.core.errors import quote
 from elastic_env.core.files import read_bounded, write_whole
-from train.cells.cell_file import MAX_BYTES, UnfitCellError, pack_evaluation, unpack_evaluation
+from train.cells import cell_file
+from train.cells.cell_file import UnfitCellError
 from train.cells.cell_key import cell_key
 from train.evaluate.conditions import Condition
 from train.evaluate.episodes import Evaluation
@@ -32,8 +33,8 @@ class Store:
         """
         file = self._file(condition)
         try:
-            content = read_bounded(file, MAX_BYTES, within=self.folder)
-            return unpack_evaluation(condition, file.stem, content)
+            content = read_bounded(file, cell_file.MAX_BYTES, within=self.folder)
+            return cell_file.unpack_evaluation(condition, file.stem, content)
         except FileNotFoundError:
             return None
         except UnfitCellError as error:
@@ -59,7 +60,7 @@ class Store:
         if key is not None and file.stem != key:
             return False
         self.folder.mkdir(parents=True, exist_ok=True)
-        write_whole(file, pack_evaluation(evaluation, file.stem))
+        write_whole(file, cell_file.pack_evaluation(evaluation, file.stem))
         return True
 
     def _file(self, condition: Condition) -> Path:

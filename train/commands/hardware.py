@@ -68,8 +68,8 @@ class Scan(Model):
                         rows.append([str(cell) for cell in cells])
         if not rows:
             console.print(
-                f"no servo answers at {self.port}; check power, wiring and baud rate, and whether"
-                " it is the IMU's port"
+                f"no servo answers at {self.port}; check power, wiring and baud rate,"
+                " and whether it is the IMU's port"
             )
             sys.exit(3)
         head = ["protocol", "bit/s", "id", "model number", "model", "firmware"]
@@ -153,7 +153,8 @@ class Run(Model):
             with run_folder("hardware", recorded, None, self.output) as folder:
                 steps = control_steps(env, policy, None)
                 metrics = _log_steps(steps, folder / "log.csv", console)
-                (folder / "metrics.json").write_text(f"{json.dumps(metrics, indent=2)}\n")
+                text = json.dumps(metrics, indent=2)
+                (folder / "metrics.json").write_text(f"{text}\n")
         console.print(f"Results in {folder}: log.csv (every step), metrics.json, config.yaml")
 
 
@@ -171,7 +172,7 @@ _COLUMNS = (
 
 
 def _log_steps(steps: Iterable[ControlStep], path: Path, console: Console) -> dict[str, Any]:
-    """Write every step, whatever ends the episode, and print a line once a second.
+    """Write every step, also of an episode cut short, and print a line once a second.
 
     Returns:
         Metrics of the episode.
@@ -280,8 +281,8 @@ class Emulate(Model):
             if config.arm is None:
                 console.print(f"IMU at {emulator.imu_port}")
                 console.print(
-                    f"or: elastic identify --port {emulator.port} --imu-port {emulator.imu_port}"
-                    " --yes --patient"
+                    f"or: elastic identify --port {emulator.port} --imu-port"
+                    f" {emulator.imu_port} --yes --patient"
                 )
             else:
                 console.print(
@@ -311,8 +312,8 @@ class Emulate(Model):
         ]
         if unused:
             raise ConfigurationError(
-                "an emulated arm has the joints of --joints and the servos of --mounting; leave out"
-                f" {list_names(unused)}"
+                "an emulated arm has the joints of --joints and the servos of"
+                f" --mounting; leave out {list_names(unused)}"
             )
         options = ArmOptions(robot=self.robot, mounting=self.mounting, dry_run=True)
         return emulator_config(ArmSetup(options, self.joints))

@@ -73,9 +73,7 @@ class ArmSetup:
             limits = self.settings.limits.replace(**PATIENT_LIMITS)
             self.settings = self.settings.replace(limits=limits)
         require_known_servos(self.settings, model)
-        self.mapping: dict[str, Any] = (
-            typical_joints(self.settings) if joints is None else dict(read_mapping(joints))
-        )
+        self.mapping = dict(read_mapping(joints)) if joints else typical_joints(self.settings)
         """Settings of the joints by name, as in a file of joints."""
         self.compensator = PositionCompensator.from_model(
             model,
@@ -98,7 +96,8 @@ class ArmSetup:
         self.ranges = self.servos.servo_ranges(self.lowest, self.highest, self.settings.limits)
         self.links = self.compensator.constants.body
         tip = options.end_effector or outermost_body(model)
-        self.tip = EndEffector(model, self.joints, tip, held_positions(model, self.joints))
+        held = held_positions(model, self.joints)
+        self.tip = EndEffector(model, self.joints, tip, held)
 
     def tip_error(self, desired: Array, links: Array) -> float:
         """Distance of the tip at link angles from that at desired angles, rms over rows [m].
@@ -126,15 +125,15 @@ def require_known_servos(settings: ArmSettings, model: mujoco.MjModel) -> None:
     for name, place in settings.joints.items():
         if name not in names:
             raise ConfigurationError(
-                f"the mounting names joint {name!r}, which the model does not have; it has"
-                f" {', '.join(names)}"
+                f"the mounting names joint {name!r}, which the model does not have; it"
+                f" has {', '.join(names)}"
             )
         if place.model is not None:
             model_number(place.model)
 
 
 def typical_joints(settings: ArmSettings) -> dict[str, Any]:
-    """Settings of the joints by name: the name of each servo, which stands for its typical values.
+    """Settings of the joints by name: names of servos, which give typical values.
 
     Raises:
         ConfigurationError: A joint has no servo whose typical values are known.

@@ -15,7 +15,7 @@ from elastic_env.hardware.safety.checks import check_bus
 from train.commands.hardware_arm import ArmSetup
 from train.runs.console import make_table
 
-_LARGEST_GAIN_RATIO = 1.4
+_MAX_GAIN_RATIO = 1.4
 """Ratio of measured gain and gain of the file above which a remark is printed [1]."""
 _REMARKS = {
     "light": "its load does not show the sign; see whether it turns as the model",
@@ -92,9 +92,9 @@ def _joint_row(setup: ArmSetup, joint: int, check: joint_check.JointCheck) -> li
     remark = "" if abs(load) >= joint_check.LEAST_LOAD_NM else "light"
     if abs(check.torque - load) > joint_check.torque_tolerance(settings, load, gain):
         remark = "load"
-    if check.gain > 0.0 and max(check.gain / gain, gain / check.gain) > _LARGEST_GAIN_RATIO:
+    if check.gain > 0.0 and max(check.gain / gain, gain / check.gain) > _MAX_GAIN_RATIO:
         remark = "k_p"
-    gains = [f"{value:.3g}" if math.isfinite(value) else "-" for value in (check.gain, gain)]
+    gains = [f"{k:.3g}" if math.isfinite(k) else "-" for k in (check.gain, gain)]
     follows = f"{100.0 * check.follow_ratio:.0f} %"
     return [name, follows, f"{check.torque:+.2f}", f"{load:+.2f}", *gains, remark]
 

@@ -23,9 +23,8 @@ def rest_table(rests: Sequence[ArmState], joints: Sequence[str]) -> Table:
     """Table of the distances between estimated links and poses, at the end of each pose."""
     errors = 1e3 * np.array([state.link - state.target for state in rests])
     rms = np.sqrt(np.mean(errors**2, axis=0))
-    largest = np.abs(errors).max(axis=0)
-    columns = zip(joints, rms, largest, strict=True)
-    rows = [[name, f"{low:.1f}", f"{high:.1f}"] for name, low, high in columns]
+    columns = zip(joints, rms, np.abs(errors).max(axis=0), strict=True)
+    rows = [[name, f"{error:.1f}", f"{most:.1f}"] for name, error, most in columns]
     title = f"estimated link from its target at {len(errors)} poses [mrad]"
     return make_table(title, ["joint", "rms", "largest"], rows)
 

@@ -48,9 +48,8 @@ def stiffened_joints(setup: ArmSetup) -> dict[str, Any]:
     for name, joint in setup.compensator.settings.items():
         gain = joint.servo.sagging_gain(name)
         if joint.is_rigid and np.isfinite(gain):
-            stiffened[name] = joint.replace(stiffness=STIFF_OVER_SERVO * gain).model_dump(
-                exclude_defaults=True
-            )
+            stiff = joint.replace(stiffness=STIFF_OVER_SERVO * gain)
+            stiffened[name] = stiff.model_dump(exclude_defaults=True)
     return stiffened
 
 

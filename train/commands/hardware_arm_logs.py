@@ -21,7 +21,7 @@ def write_servo_logs(log: Path, setup: ArmSetup) -> list[Path]:
     the weight and of the other joints' motion, by the model at the encoders' angles.
 
     Args:
-        log: Log of the motion; the new files go beside it.
+        log: Log of the motion; the new files go into its folder.
         setup: The arm.
 
     Returns:

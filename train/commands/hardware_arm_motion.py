@@ -56,7 +56,8 @@ def move_arm(
         console.print(f"{len(setup.joints)} servos at {setup.settings.port}: {servos}")
         simulation = None
         if options.dry_run:
-            bus = simulation = stack.enter_context(VirtualBus(dry_run.emulator_config(setup)))
+            config = dry_run.emulator_config(setup)
+            bus = simulation = stack.enter_context(VirtualBus(config))
             if dry_run.stiffened_joints(setup):
                 console.print(f"rigid joints are emulated with K = {STIFF_OVER_SERVO:g} k_p")
             check_servos(setup, bus.driver, console)
@@ -102,8 +103,8 @@ def _consent_question(setup: ArmSetup) -> str:
     nudges = f"move each joint by ±{options.nudge_rad:g} rad, away from a stop, then "
     return (
         f"The {len(setup.joints)} servos at {setup.settings.port} will"
-        f" {nudges if options.check else ''}follow the targets"
-        f" with up to {setup.settings.speed_rad_s:g} rad/s. Is the way free, and the power switch"
+        f" {nudges if options.check else ''}follow the targets with up to"
+        f" {setup.settings.speed_rad_s:g} rad/s. Is the way free, and the power switch"
         " in reach?"
     )
 
@@ -116,7 +117,7 @@ def _follow_targets(
     console: Console,
     simulation: VirtualBus | None,
 ) -> dict[int, ArmState]:
-    """Follow the targets and go back; write logs and summary, whatever ends the motion."""
+    """Follow the targets and go back; write the logs, also of an interrupted motion."""
     rests: dict[int, ArmState] = {}
     true_links: dict[int, Array] = {}
     is_interrupted = False
@@ -146,7 +147,8 @@ def _follow_targets(
             finally:
                 file.flush()
                 files = [path, *write_servo_logs(path, setup)]
-    _print_summary(arm, rests if isinstance(targets, Poses) else {}, true_links, setup, console)
+    at_poses = rests if isinstance(targets, Poses) else {}
+    _print_summary(arm, at_poses, true_links, setup, console)
     print_files(folder, files, console)
     if is_interrupted and not isinstance(targets, Stream):
         raise KeyboardInterrupt

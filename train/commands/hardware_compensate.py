@@ -79,8 +79,8 @@ class LogPoses(ArmOptions):
     """Log poses of an arm for elastic identify, each approached from both sides.
 
     The joints need not be identified: targets are sent as they are. Writes log.csv with every
-    cycle, servo_JOINT.csv of each servo for elastic identify --log, and poses.csv with the rests,
-    to which a tracker's columns can be added.
+    cycle, servo_JOINT.csv of each servo for elastic identify --log, and poses.csv with the rests. A
+    tracker's columns can be added to poses.csv.
 
     Example: elastic hardware log --robot arm.urdf --mounting mounting.yaml --port /dev/ttyACM0
 
@@ -115,7 +115,8 @@ class LogPoses(ArmOptions):
             poses = self._poses(setup, start)
             return Poses(poses_from_both_sides(poses, self.apart_rad), self.hold_s)
 
-        folder, rests = move_arm(setup, Uncompensated(setup.compensator), make_targets, console)
+        compensator = Uncompensated(setup.compensator)
+        folder, rests = move_arm(setup, compensator, make_targets, console)
         path = write_rests(folder / "poses.csv", rests, setup.joints)
         console.print(f"  {path}")
 

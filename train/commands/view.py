@@ -42,7 +42,7 @@ LARGEST_FACTOR = 20.0
 
 _FRAMES_PER_S = 50
 _PAUSE_S = 0.01
-_SOCKET_FOLDER = "/tmp"
+_SOCKET_DIR = "/tmp"
 """Folder of the socket: its path may have about 100 characters, and TMPDIR may be longer."""
 _TITLE = "elastic view: reference, motor side, link side"
 _FACTOR = "deviations drawn x"
@@ -219,7 +219,7 @@ def show(recording: Recording, host: str = LOOPBACK, port: int = 0) -> Iterator[
     access = Access(host, browsers.getsockname()[1])
     with (
         contextlib.closing(browsers),
-        tempfile.TemporaryDirectory(prefix="elastic_view_", dir=_SOCKET_FOLDER) as folder,
+        tempfile.TemporaryDirectory(prefix="elastic_view_", dir=_SOCKET_DIR) as folder,
         _launch(recording, f"{folder}/viewer") as handle,
         contextlib.closing(Proxy(browsers, f"{folder}/viewer", access)),
     ):
@@ -281,8 +281,8 @@ class View(WatchedEpisode):
         with show(recording, self.host, self.port) as page:
             console.print(f"the page is at {page.access.address}", highlight=False)
             if not page.access.is_local:
-                rights = "can see the page and move its sliders; the connection is not encrypted"
-                console.print(f"whoever has this address {rights}")
+                rights = "see the page and move its sliders; nothing is encrypted"
+                console.print(f"anyone with this address can {rights}")
             console.print("Ctrl-C ends it")
             # opens a tab of the browser, if there is a display
             has_display = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")

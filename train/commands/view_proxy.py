@@ -35,7 +35,7 @@ _TOKEN = "token="
 _CURE = "open the address that elastic view has printed"
 _UPLOAD = "/drop"
 _SOCKETS = ("/ui", "/state")
-_UPGRADE_HEADERS = "(?i)upgrade|connection|sec-websocket-(key|version|protocol|extensions)"
+_UPGRADE = "(?i)upgrade|connection|sec-websocket-(key|version|protocol|extensions)"
 """Headers that open a WebSocket, which the viewer gets."""
 _PRIVACY_HEADERS = (
     ("Cross-Origin-Resource-Policy", "same-origin"),
@@ -160,10 +160,12 @@ class Access:
         is_socket = bool(request.values("Upgrade"))
         _require(path.rstrip("/").lower() != _UPLOAD, "this page takes no uploads")
         has_body = any(map(request.values, ("Content-Length", "Transfer-Encoding")))
-        _require(method == "GET" and not has_body, "this page only answers GET without a body")
-        _require(not is_socket or path in _SOCKETS, f"WebSockets are {', '.join(_SOCKETS)}")
-        query = "&".join(others)
-        return AdmittedRequest(f"{path}?{query}" if query else path, is_socket, has_address)
+        is_download = method == "GET" and not has_body
+        _require(is_download, "this page only answers GET without a body")
+        is_known = not is_socket or path in _SOCKETS
+        _require(is_known, f"WebSockets are {', '.join(_SOCKETS)}")
+        query = f"?{'&'.join(others)}" if others else ""
+        return AdmittedRequest(path + query, is_socket, has_address)
 
     def _require_own_host(self, request: Head) -> None:
         """Check that Host and Origin are those of the page.
@@ -175,7 +177,8 @@ class Access:
         origins = [origin.lower() for origin in request.values("Origin")]
         is_own = len(hosts) == 1 and self._is_own(hosts[0])
         _require(is_own, f"the Host is not this page's: {_CURE}")
-        _require(origins in ([], [f"http://{hosts[0]}"]), "the request comes from another page")
+        is_here = origins in ([], [f"http://{hosts[0]}"])
+        _require(is_here, "the request comes from another page")
 
     def _is_own(self, host: str) -> bool:
         """Return True if a Host is one of the names of the page, with its port."""
@@ -235,8 +238,8 @@ def open_listener(host: str = LOOPBACK, port: int = 0) -> socket.socket:
         family = socket.getaddrinfo(host or None, port, **kind)[0][0]
     except (socket.gaierror, UnicodeError):
         raise ConfigurationError(
-            f"--host must be an address or a name of this machine, such as {LOOPBACK}, got"
-            f" {quote(host)}"
+            f"--host must be an address or a name of this machine, such as {LOOPBACK},"
+            f" got {quote(host)}"
         ) from None
     problem = OSError()
     has_both = host == "::"
@@ -246,8 +249,8 @@ def open_listener(host: str = LOOPBACK, port: int = 0) -> socket.socket:
         except OSError as error:
             problem = error
     raise SystemFailedError(
-        f"the page cannot listen at {quote(host)}, port {port}: {problem.strerror}; name another"
-        " --port, or 0 for a free one"
+        f"the page cannot listen at {quote(host)}, port {port}: {problem.strerror};"
+        " name another --port, or 0 for a free one"
     ) from None
 
 
@@ -299,7 +302,8 @@ class Proxy:
         self, request: Head, admitted: AdmittedRequest, reader: StreamReader, writer: StreamWriter
     ) -> None:
         """Forward a request to the viewer and its answer to the browser, until one side closes."""
-        viewer, to_viewer = await asyncio.open_unix_connection(self._viewer, limit=_MAX_HEAD)
+        connection = asyncio.open_unix_connection(self._viewer, limit=_MAX_HEAD)
+        viewer, to_viewer = await connection
         try:
             to_viewer.write(_viewer_head(request, admitted).encode())
             answer = Head.parse(await viewer.readuntil(b"\r\n\r\n"))
@@ -318,14 +322,14 @@ class Proxy:
 
     def _browser_head(self, answer: Head, admitted: AdmittedRequest) -> Head:
         """Head of an answer that no other page may read; the first one sets the cookie."""
-        headers = [header for header in answer.headers if not _is_sharing(header[0])]
+        headers = [pair for pair in answer.headers if not _is_sharing(pair[0])]
         headers += _PRIVACY_HEADERS
         if not admitted.is_socket:
-            headers = [header for header in headers if header[0].lower() != "connection"]
+            headers = [pair for pair in headers if pair[0].lower() != "connection"]
             headers.append(("Connection", "close"))
         if admitted.has_address:
-            value = f"{self._access.cookie}={self._access.token}"
-            headers.append(("Set-Cookie", f"{value}; Path=/; HttpOnly; SameSite=Strict"))
+            pair = f"{self._access.cookie}={self._access.token}"
+            headers.append(("Set-Cookie", f"{pair}; Path=/; HttpOnly; SameSite=Strict"))
         return Head(answer.line, headers)
 
 
@@ -346,7 +350,7 @@ def _viewer_head(request: Head, admitted: AdmittedRequest) -> Head:
     """Head of a request for the viewer: without token, cookies and Origin."""
     headers = [("Host", "viewer")]
     if admitted.is_socket:
-        headers += [pair for pair in request.headers if re.fullmatch(_UPGRADE_HEADERS, pair[0])]
+        headers += [pair for pair in request.headers if re.fullmatch(_UPGRADE, pair[0])]
     return Head(f"GET {admitted.path} HTTP/1.1", headers)
 
 

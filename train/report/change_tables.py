@@ -41,8 +41,8 @@ def print_changes(rows: Sequence[Change], console: Console) -> None:
         if group[0].is_family or lines <= _MAX_LINES:
             print_table(cells_table(group), console, "statistics.csv")
         else:
-            title = f"{lines} changes of policies without training against {group[0].base}"
-            console.print(f"{title}: see statistics.csv and report.md")
+            title = f"{lines} changes of policies without training against"
+            console.print(f"{title} {group[0].base}: see statistics.csv and report.md")
 
 
 def cells_table(rows: Sequence[Change]) -> Table:
@@ -71,14 +71,14 @@ def cells_table(rows: Sequence[Change]) -> Table:
         figures = [signed_interval(row.relative, row.verdict) for row in line]
         cells = (*labels, *first.first.swept_values(swept), *figures, _failures(first))
         lines.append(Row(cells, "group" if first.is_group else ""))
-    signs = _signs([mark for row in rows for mark in row.marks])
+    used = _signs([mark for row in rows for mark in row.marks])
     return Table(
         tuple(heads),
         tuple(lines),
         keys=len(names),
         title=f"change against {_opponent(rows)} on the same episodes, {_statistic(rows)}",
         subjects=policies if is_one else (),
-        caption=". ".join([*(f"{sign} {_SIGNS[sign]}" for sign in signs), change_text.SIGNS_ARE]),
+        caption=". ".join([*(f"{s} {_SIGNS[s]}" for s in used), change_text.SIGNS_ARE]),
     )
 
 
@@ -98,7 +98,8 @@ def changes_table(rows: Sequence[Change], colours: Mapping[str, str]) -> Table:
     heads += [Head("95 % over"), Head(f"{rows[0].failure} (base)")]
     heads += [Head("what it shows", is_number=False)] * is_family
     lines = []
-    for (policy, base), block in group_by(rows, lambda row: (row.policy, row.base)).items():
+    blocks = group_by(rows, lambda row: (row.policy, row.base))
+    for (policy, base), block in blocks.items():
         number = block[0].num_seeds
         seeds = f", {number} training seed{'s' * (number != 1)}" if is_family else ""
         title = f"{policy} against {base}{seeds}"
@@ -109,8 +110,7 @@ def changes_table(rows: Sequence[Change], colours: Mapping[str, str]) -> Table:
             cells += [*row.first.swept_values(swept), row.column.title, _means(row)]
             cells += [(Part(percent_interval(row.relative), row.verdict),)]
             cells += [percent_interval(row.improvement, signed=False)]
-            cells += [row.relative.over or "-", (failed,)]
-            cells += [row.sentence] if is_family else []
+            cells += [row.relative.over or "-", (failed,), *[row.sentence] * is_family]
             lines.append(Row(tuple(cells), kind="group" if row.is_group else ""))
     return Table(tuple(heads), tuple(lines), keys=3 + len(swept), kind="changes")
 
@@ -155,7 +155,7 @@ def _opponent(rows: Sequence[Change]) -> str:
 
 def _signs(marks: Sequence[str]) -> list[str]:
     """Return the signs that stand for some marks."""
-    return [sign for sign, mark in _SIGNS.items() if any(m.startswith(mark) for m in marks)]
+    return [s for s, mark in _SIGNS.items() if any(m.startswith(mark) for m in marks)]
 
 
 def _failures(row: Change) -> str:
@@ -202,7 +202,7 @@ def _record(row: Change, swept: Sequence[str]) -> dict[str, object]:
 
 def write_maps(maps: Sequence[HeatMap], path: Path) -> Path:
     """Write a CSV row per cell, metric and policy: scores in SI units, changes as shares."""
-    return write_records([row for heat_map in maps for row in _map_records(heat_map)], path)
+    return write_records([row for grid in maps for row in _map_records(grid)], path)
 
 
 _CHANGE_COLUMNS = (*Estimate(0.0).record("change"), "verdict")
@@ -217,7 +217,8 @@ def _map_records(heat_map: HeatMap) -> Iterator[dict[str, object]]:
                 change = cell.learned.get(title)
                 change_record: dict[str, object] = dict.fromkeys(_CHANGE_COLUMNS, "")
                 if change is not None:
-                    change_record = {**change.relative.record("change"), "verdict": change.verdict}
+                    change_record = change.relative.record("change")
+                    change_record["verdict"] = change.verdict
                 failed, episodes = cell.failed[title]
                 yield {
                     "map": heat_map.title,

@@ -78,12 +78,8 @@ def _dot_plot(
         }
         data.append(texts)
         domain = plotly_charts.domain(number, len(panels), gap=0.03)
-        layout[f"xaxis{plotly_charts.nth(number)}"] = {
-            **axis,
-            "domain": domain,
-            "anchor": "y",
-            "side": "top",
-        }
+        place = {"domain": domain, "anchor": "y", "side": "top"}
+        layout[f"xaxis{plotly_charts.nth(number)}"] = {**axis, **place}
     layout["yaxis"] = base_axis(
         range=[max(rows, default=0.0) + 0.7, -0.7],
         tickvals=list(rows),
@@ -195,7 +191,7 @@ def forest(rows: Sequence[Change]) -> Spec:
     """Return the chart of changes of one residual against its base, in all cells."""
     lines = group_lines(rows)
     several = len({row.reference for row in rows}) > 1
-    names = [f"{row.reference} · {row.scope}" if several else row.scope for row, *_ in lines]
+    names = [f"{r.reference} · {r.scope}" if several else r.scope for r, *_ in lines]
     panels = []
     for column, metric_rows in group_by(rows, lambda row: row.column).items():
         changes = [row.relative.times(100.0) for row in metric_rows]
@@ -211,7 +207,8 @@ def forest(rows: Sequence[Change]) -> Spec:
             zerolinewidth=1.2,
         )
         # texts begin right of all intervals, so that the line at zero crosses none
-        panels.append((axis, [_change_dot(n, row, high) for n, row in enumerate(metric_rows)]))
+        dots = [_change_dot(n, row, high) for n, row in enumerate(metric_rows)]
+        panels.append((axis, dots))
     titles = [
         f"<b>{chart_text(name)}</b>" if line[0].is_group else chart_text(name)
         for name, line in zip(names, lines, strict=True)
@@ -225,6 +222,7 @@ def forest(rows: Sequence[Change]) -> Spec:
 
 
 def _change_dot(place: int, row: Change, text_x: float) -> Dot:
+    change = row.relative
     symbol = "circle"
     if CEILING in row.marks:
         symbol = "star"
@@ -232,8 +230,8 @@ def _change_dot(place: int, row: Change, text_x: float) -> Dot:
         symbol = "circle-open"
     return Dot(
         place,
-        row.relative.times(100.0),
-        percent_interval(row.relative) if row.relative.is_known else "nothing to compare",
+        change.times(100.0),
+        percent_interval(change) if change.is_known else "nothing to compare",
         text_x,
         f"{row.scope}: {row.sentence}",
         VERDICTS[row.verdict],

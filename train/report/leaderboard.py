@@ -62,8 +62,10 @@ def _table(shown: Sequence[Standing], all_standings: Sequence[Standing]) -> Tabl
             rows.append(Row((str(track),), kind="heading"))
         places = {(s.policy, s.scope, s.reference, s.metric): s for s in standings}
         best = {}
-        for key, rivals in group_by(standings, lambda s: (s.scope, s.reference, s.metric)).items():
-            best[key] = best_of({s.policy: (s.score, (s.failed, s.episodes)) for s in rivals})
+        cells = group_by(standings, lambda s: (s.scope, s.reference, s.metric))
+        for key, rivals in cells.items():
+            scores = {s.policy: (s.score, (s.failed, s.episodes)) for s in rivals}
+            best[key] = best_of(scores)
         order = dict.fromkeys((s.policy for s in standings), math.inf)
         for s in standings:
             if (s.scope, s.reference, s.metric) == (*columns[0], metrics[0]) and s.score.is_known:
@@ -83,18 +85,18 @@ def _table(shown: Sequence[Standing], all_standings: Sequence[Standing]) -> Tabl
     return Table(tuple(heads), tuple(rows), title=title, kind="board")
 
 
-def _metric_labels(standings: Sequence[Standing]) -> str:
+def _metric_labels(shown: Sequence[Standing]) -> str:
     """Return the metrics of a cell of the leaderboard, with their units."""
-    return " / ".join(dict.fromkeys(f"{s.title} [{_column(s).unit}]" for s in standings))
+    return " / ".join(dict.fromkeys(f"{s.title} [{_column(s).unit}]" for s in shown))
 
 
 def _totals(policy: str, standings: Sequence[Standing]) -> list[str]:
     """Return failed episodes of all, and time per step; nothing for a table without totals."""
-    of_policy = [s for s in standings if s.policy == policy]
-    if not of_policy:
+    chosen = [s for s in standings if s.policy == policy]
+    if not chosen:
         return []
-    single = [s for s in of_policy if not s.is_group and s.metric == of_policy[0].metric]
-    step_us = of_policy[0].step_us
+    single = [s for s in chosen if not s.is_group and s.metric == chosen[0].metric]
+    step_us = chosen[0].step_us
     failed = f"{sum(s.failed for s in single)}/{sum(s.episodes for s in single)}"
     return [failed, "-" if math.isnan(step_us) else f"{step_us:.0f}"]
 
@@ -114,8 +116,9 @@ def _entry(
         if score.has_interval:
             low, high = map(three_digits, score.ends)
             intervals.append(Part(f"[{low}, {high}]", "small"))
-    if standings[0].failed:
-        parts.append(Part(f"✕{standings[0].failed}/{standings[0].episodes}", "failure", before=" "))
+    first = standings[0]
+    if first.failed:
+        parts.append(Part(f"✕{first.failed}/{first.episodes}", "failure", before=" "))
     return (*parts, *intervals)
 
 
@@ -186,7 +189,8 @@ def add_leaderboard(page: Page, standings: Sequence[Standing]) -> None:
         page.add("table", claims)
     single = scenarios_table(standings)
     if single is not None:
-        page.add("table", single, f"Single scenarios, {standings[0].reference}", is_folded=True)
+        title = f"Single scenarios, {standings[0].reference}"
+        page.add("table", single, title, is_folded=True)
 
 
 def leaderboard_markdown(standings: Sequence[Standing]) -> str:
@@ -253,8 +257,8 @@ def read_leaderboard(path: Path) -> list[Standing]:
         try:
             standings = [_standing(row) for row in csv.DictReader(file)]
         except ValidationError as error:
-            problem = error.errors()[0]["msg"]
-            raise ConfigurationError(f"{shorten(path)} is no leaderboard.csv: {problem}") from None
+            problem = f"{shorten(path)} is no leaderboard.csv: {error.errors()[0]['msg']}"
+            raise ConfigurationError(problem) from None
         except (KeyError, TypeError, ValueError, csv.Error) as error:
             problem = f"{shorten(path)} is no leaderboard.csv: {error!r}"
             raise ConfigurationError(problem) from None
@@ -287,6 +291,6 @@ def _parse_paired(to: str, value: str, low: str, high: str, verdict: str) -> Pai
 
 _NEW_FIELDS = ("interval_over", "origin", "is_published")
 """Fields that older leaderboards lack."""
-_PARSERS: Mapping[int, Callable[..., Any]] = {1: str, 3: _parse_estimate, 5: _parse_paired}
+_PARSERS: dict[int, Callable[..., Any]] = {1: str, 3: _parse_estimate, 5: _parse_paired}
 """Functions that make a field from its cells, by the number of cells."""
 _STANDING = TypeAdapter(Standing)

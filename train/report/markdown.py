@@ -26,7 +26,8 @@ def to_markdown(table: Table) -> str:
 def _markdown_cell(cell: Cell) -> str:
     text = ""
     for part in parts_of(cell):
-        text += part.before + _LOOKS.get(part.style, "{}").format(markdown_text(part.text))
+        look = _LOOKS.get(part.style, "{}")
+        text += part.before + look.format(markdown_text(part.text))
     return text
 
 

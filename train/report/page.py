@@ -27,8 +27,8 @@ class Part:
 
     Attributes:
         kind: Kind of the content; captions, charts and pictures are on the page only.
-        content: A text, texts, pairs of texts, a `Table`, a chart's `Spec`, the panels of a map, or
-            the file of a picture in the folder of the page.
+        content: A text, texts, pairs of texts, a `Table`, a chart's `Spec`, panels of a map, or the
+            file of a picture.
         title: Title above the content; empty for none.
         is_folded: True if the part can be folded under its title. A chart is drawn when it is
             unfolded.

@@ -78,7 +78,8 @@ def _panel_axis(panel: Panel, place: Sequence[float]) -> Spec:
         options = {"tickvals": places, "ticktext": titles, "showgrid": False}
     if panel.limits is not None:
         options["range"] = [digits(end) for end in panel.limits]
-    return base_axis("" if panel.rows else panel.label, domain=list(place), anchor="x", **options)
+    label = "" if panel.rows else panel.label
+    return base_axis(label, domain=list(place), anchor="x", **options)
 
 
 def _curve_traces(curve: Curve, axis: str, is_first: bool) -> list[Spec]:

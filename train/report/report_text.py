@@ -71,7 +71,7 @@ class Results:
         """Learning curves of the families whose folders are in a training run."""
         families = self.table.families.items()
         judged = self.environment.judged
-        curves = {title: learning_curves(family.folders, judged) for title, family in families}
+        curves = {title: learning_curves(f.folders, judged) for title, f in families}
         return {title: curve for title, curve in curves.items() if curve is not None}
 
     @cached_property
@@ -97,7 +97,8 @@ class Results:
     @property
     def compared_pairs(self) -> list[list[Change]]:
         """`judged_changes` by residual and kind of opponent."""
-        return list(group_by(self.judged_changes, lambda row: (row.policy, row.is_rival)).values())
+        pairs = group_by(self.judged_changes, lambda row: (row.policy, row.is_rival))
+        return list(pairs.values())
 
     @property
     def rivalled_residuals(self) -> set[str]:
@@ -115,7 +116,7 @@ class Results:
         others = [row for row in self.judged_changes if not row.is_rival]
         bases = {(row.policy, row.place, row.column): row for row in others[::-1]}
         shown = [row for row in rivals if row.is_group]
-        if not shown and len({(row.policy, row.place) for row in rivals}) <= _MAX_CLAIMS:
+        if not shown and len({(r.policy, r.place) for r in rivals}) <= _MAX_CLAIMS:
             shown = rivals
         return [(row, bases[row.policy, row.place, row.column]) for row in shown]
 
@@ -126,7 +127,7 @@ class Results:
 
 
 _MAX_CLAIMS = 4
-"""Largest number of scenarios that have a sentence each, if there are no groups."""
+"""Most pairs of residual and scenario that have a sentence each, if there are no groups."""
 
 
 def sentences(kind: Literal["headline", "in_short", "notes"], results: Results) -> list[str]:
@@ -138,11 +139,12 @@ def sentences(kind: Literal["headline", "in_short", "notes"], results: Results) 
         "failures": failures,
         "ranked": _rank_policies,
         "by_metric": lambda rows: group_by(rows, lambda row: row.column).values(),
-        "marks": [kind for kind in kinds if any(mark.startswith(kind) for mark in marks)],
+        "marks": [kind for kind in kinds if any(m.startswith(kind) for m in marks)],
         "verdict_words": _VERDICTS,
     }
     text = getattr(load_template("sentences.j2").make_module(helpers), kind)(results)
-    return list(filter(None, [re.sub(r"[ \n]+", " ", part).strip() for part in text.split("\n\n")]))
+    parts = [re.sub(r"[ \n]+", " ", part).strip() for part in text.split("\n\n")]
+    return list(filter(None, parts))
 
 
 def _rank_policies(table: EpisodeTable) -> list[dict[str, Any]]:
@@ -186,9 +188,7 @@ def facts(results: Results) -> list[tuple[str, str]]:
     origin = results.metadata
     seeds = table.rows["seed"].tolist()
     per_cell = sorted({len(e.episodes) for e in results.evaluations})
-    versions = ", ".join(
-        f"{name} {version}" for name, version in origin["versions"].items() if version
-    )
+    versions = [f"{name} {v}" for name, v in origin["versions"].items() if v]
     each = " and training seed" if table.members else ""
     played = f"{_span(per_cell)} per cell{each}, seeds {_span(sorted({min(seeds), max(seeds)}))}"
     return [
@@ -197,7 +197,7 @@ def facts(results: Results) -> list[tuple[str, str]]:
         ("scenarios", ", ".join(table.scenarios)),
         ("episodes", played),
         ("made", f"{origin['created']}, commit {origin['commit'] or 'unknown'}"),
-        ("versions", f"Python {origin['python']}, {versions}"),
+        ("versions", f"Python {origin['python']}, {', '.join(versions)}"),
         *((title, _training_text(family)) for title, family in table.families.items()),
     ]
 

@@ -24,13 +24,16 @@ from train.runs.escaping import write_records
 def scores_table(table: EpisodeTable, columns: Sequence[Column]) -> Table:
     """Return the mean of every policy in every cell, with intervals."""
     rows = []
-    for reference, scenario, policy in product(table.references, table.scenarios, table.policies):
+    places = product(table.references, table.scenarios, table.policies)
+    for reference, scenario, policy in places:
         for cell in table.cells_of(policy, reference, scenario):
             condition = table.conditions[policy, cell]
             episodes = table.rows_of(policy, cell)
-            episodes = episodes_as_robots(episodes) if condition.member is None else episodes
+            if condition.member is None:
+                episodes = episodes_as_robots(episodes)
             units = ([len(set(episodes["robot"]))], [condition.draws_robots])
-            scores = [count_episodes_apart(score(episodes, column), *units) for column in columns]
+            scores = [score(episodes, column) for column in columns]
+            scores = [count_episodes_apart(estimate, *units) for estimate in scores]
             figures = map(number_interval, scores, columns)
             over = next((estimate.over for estimate in scores if estimate.over), "-")
             values = condition.swept_values(table.swept)
@@ -61,10 +64,8 @@ def robots_table(cells: Sequence[RobotScores]) -> Table:
     for row in cells:
         names = (row.reference, row.scope, row.policy, row.column.label)
         scores = [number_interval(estimate, row.column) for estimate in row.scores]
-        better = [
-            f"{title}: {percent_interval(share, signed=False)}"
-            for title, share in row.better.items()
-        ]
+        shares = row.better.items()
+        better = [f"{k}: {percent_interval(v, signed=False)}" for k, v in shares]
         others = "; ".join(better) or "-"
         failed = f"{row.failed}/{row.episodes}"
         rows.append(Row((*names, *scores, failed, row.mean.over or "-", others)))
@@ -89,9 +90,7 @@ def print_robots(cells: Sequence[RobotScores], console: Console) -> None:
         for policy, metrics in group_by(group, lambda row: row.policy).items():
             figures = {row.column: row.scores for row in metrics}
             failed = f"{metrics[0].failed}/{metrics[0].episodes}"
-            texts = (
-                number_interval(score, column) for column in columns for score in figures[column]
-            )
+            texts = (number_interval(score, c) for c in columns for score in figures[c])
             rows.append(Row((policy, *texts, failed)))
     number = max(row.mean.robots for row in cells)
     title = f"means over up to {number} drawn robots, those that did not fail [95 % interval]"

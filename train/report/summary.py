@@ -51,7 +51,7 @@ def summary_table(
     environment = evaluations[0].condition.environment
     swept = list(dict.fromkeys(name for e in evaluations for name in e.condition.swept))
     judged = {column.metric for column in environment.judged}
-    heads = [Head(name, is_number=False) for name in ("reference", "scenario", "policy")]
+    heads = [Head(key, is_number=False) for key in ("reference", "scenario", "policy")]
     heads += [Head(name) for name in swept]
     for column in columns:
         leaves = 2 if column.metric in judged else 1
@@ -61,9 +61,9 @@ def summary_table(
     for e in evaluations:
         condition = e.condition
         names = [condition.reference_name, condition.scenario, condition.policy.title]
-        values = condition.swept_values(swept)
         figures = [_figure(e, column, worst, intervals) for column in columns]
-        rows.append(Row((*names, *values, *figures, f"{e.num_failed}/{len(e.episodes)}")))
+        failed = f"{e.num_failed}/{len(e.episodes)}"
+        rows.append(Row((*names, *condition.swept_values(swept), *figures, failed)))
     title = f"{environment.subject}, median over episodes"
     title += _interval_label(evaluations) if intervals else ""
     return Table(tuple(heads), tuple(rows), keys=3, title=title, caption=environment.note)
@@ -91,7 +91,7 @@ def failure_notes(evaluations: Sequence[Evaluation]) -> list[str]:
         number = len(e.episodes)
         if e.num_failed < number or not number:
             continue
-        reasons = "/".join(dict.fromkeys(episode["termination"] for episode in e.episodes))
+        reasons = "/".join(dict.fromkeys(row["termination"] for row in e.episodes))
         times = e.values("duration_s", failed=True)
         when = f" after {np.median(times):.1f} s" if len(times) else ""
         condition = e.condition
@@ -135,11 +135,12 @@ def _parts(evaluations: Sequence[Evaluation]) -> list[str]:
     statistic = f"Median over the episodes that did not fail{worst}"
     parts = [
         f"{capital(environment.subject)}. {statistic}; failures are counted separately.",
-        " ".join([*column_notes(environment.columns), *filter(None, [environment.note])]),
+        " ".join(filter(None, [*column_notes(environment.columns), environment.note])),
         to_markdown(summary_table(evaluations, environment.columns, worst=True)),
     ]
     for title, columns in environment.splits.items():
-        parts += [f"{title}:", to_markdown(summary_table(evaluations, columns, worst=True))]
+        table = summary_table(evaluations, columns, worst=True)
+        parts += [f"{title}:", to_markdown(table)]
     if notes := failure_notes(evaluations):
         parts += ["Where all episodes failed:", bullets(notes)]
     return [*parts, *bound_notes(evaluations)]

@@ -41,7 +41,7 @@ class Head:
         note: Explanation of the title, for the caption; empty if it needs none.
         second: Second part of the title, on a line of its own where titles have several lines.
         is_number: True for figures, aligned to the right; false for words.
-        wraps: True if the words of a cell may be on several lines of a terminal.
+        wraps: True if the words of a cell may be on several lines of a terminal; no word is broken.
         leaves: Turn in which the column is left out if a terminal has no room: 1 before 2; 0 for
             never. The last column that may be left out stays.
         titles: True if the title of the table may name the column's value, if all are the same.
@@ -127,7 +127,8 @@ class Table:
             cells = row.cells[:place] + row.cells[place + 1 :]
             rows.append(row if row.kind == "heading" else replace(row, cells=cells))
         heads = self.heads[:place] + self.heads[place + 1 :]
-        return replace(self, heads=heads, rows=tuple(rows), keys=self.keys - (place < self.keys))
+        keys = self.keys - (place < self.keys)
+        return replace(self, heads=heads, rows=tuple(rows), keys=keys)
 
     @property
     def sparse_rows(self) -> list[Row]:
@@ -136,11 +137,11 @@ class Table:
         above: tuple[Cell, ...] = ()
         for row in self.rows:
             is_heading = row.kind == "heading"
-            repeated = 0
+            same = 0
             limit = 0 if is_heading else self.keys - 1
-            while repeated < limit and row.cells[: repeated + 1] == above[: repeated + 1]:
-                repeated += 1
-            rows.append(replace(row, cells=("",) * repeated + row.cells[repeated:]))
+            while same < limit and row.cells[: same + 1] == above[: same + 1]:
+                same += 1
+            rows.append(replace(row, cells=("",) * same + row.cells[same:]))
             above = () if is_heading else row.cells
         return rows
 

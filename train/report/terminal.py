@@ -41,7 +41,7 @@ def print_table(table: Table, console: Console, file: str) -> None:
 
 
 def has_room(table: Table, console: Console) -> bool:
-    """Return true if a terminal has room for all columns of a table."""
+    """Return True if a terminal has room for all columns of a table."""
     return _fit(table, console) is not None
 
 

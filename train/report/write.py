@@ -72,7 +72,8 @@ def write_page(page: Page, folder: Path) -> list[Path]:
 
 
 def _page(results: Results) -> Page:
-    under = f"{capital(results.environment.subject)}; made {results.metadata['created'][:10]}"
+    subject = capital(results.environment.subject)
+    under = f"{subject}; made {results.metadata['created'][:10]}"
     page = Page(f"Comparison: {results.name}", under)
     page.section("What was compared", *sentences("headline", results))
     page.add("definitions", facts(results))
@@ -98,7 +99,8 @@ def _page(results: Results) -> Page:
     if results.learning:
         columns = results.environment.judged
         page.section("Learning curves", TEXTS["learning"])
-        page.add("chart", page_chart(learning_chart(results.learning, columns, results.colours)))
+        chart = learning_chart(results.learning, columns, results.colours)
+        page.add("chart", page_chart(chart))
         table = learning_table(results.learning, columns)
         page.add("table", table, "Table of learning curves", is_folded=True)
     page.section("Notes")

@@ -44,12 +44,12 @@ class PlainConsole(Console):
         self, renderable: RenderableType, options: ConsoleOptions | None = None
     ) -> Iterable[Segment]:
         """Make all texts visible; Rich's own terminal commands stay."""
-        for segment in super().render(renderable, options):
-            yield segment if segment.control else Segment(visible(segment.text), segment.style)
+        for part in super().render(renderable, options):
+            yield part if part.control else Segment(visible(part.text), part.style)
 
 
 def can_redraw(console: Console) -> bool:
-    """Return true if lines can be drawn again in place.
+    """Return True if lines can be drawn again in place.
 
     Rich treats a notebook, and a CI that asks for colours, as terminals. Both show each drawing
     below the last one.
@@ -57,9 +57,10 @@ def can_redraw(console: Console) -> bool:
     return console.is_terminal and console.file.isatty()
 
 
-def make_table(
-    title: str, head: Sequence[str], rows: Iterable[Sequence[str]], left: int = 1, **style: Any
-) -> Table:
+_Row = Sequence[str]
+
+
+def make_table(title: str, head: _Row, rows: Iterable[_Row], left: int = 1, **style: Any) -> Table:
     """Return a table of plain texts.
 
     Args:

@@ -43,7 +43,8 @@ def csv_cell(value: Any) -> Any:
     if not isinstance(value, str):
         return value
     text = visible(value)
-    return f"'{text}" if text.startswith(_FORMULA) and not _NUMBERS.fullmatch(text) else text
+    is_formula = text.startswith(_FORMULA) and not _NUMBERS.fullmatch(text)
+    return f"'{text}" if is_formula else text
 
 
 def write_csv(head: Sequence[str], rows: Iterable[Iterable[Any]], path: Path) -> Path:
@@ -57,7 +58,7 @@ def write_csv(head: Sequence[str], rows: Iterable[Iterable[Any]], path: Path) ->
 def write_records(records: Sequence[Mapping[str, Any]], path: Path) -> Path:
     """Write a CSV file of rows by column name; columns that a row lacks are empty."""
     head = list(dict.fromkeys(name for record in records for name in record))
-    return write_csv(head, [[record.get(name, "") for name in head] for record in records], path)
+    return write_csv(head, [[r.get(name, "") for name in head] for r in records], path)
 
 
 def markdown_text(text: str) -> str:

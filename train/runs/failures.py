@@ -38,7 +38,7 @@ _CURES = {
     errno.EACCES: "name a folder that can be written, by --output",
 }
 
-_FULL_DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+_DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 class SignalError(KeyboardInterrupt):
@@ -69,12 +69,12 @@ def explain(error: BaseException) -> tuple[str, int] | None:
 
 
 def is_interrupt(error: BaseException) -> bool:
-    """Return true for Ctrl-C, which a loading module or a call of C may turn into another error."""
+    """Return True for Ctrl-C, which a loading module or a call of C may turn into another error."""
     return any(map(_names_interrupt, _causes(error)))
 
 
 def _names_interrupt(error: BaseException) -> bool:
-    """Return true for an interrupt, or an error of `ctypes` that quotes one.
+    """Return True for an interrupt, or an error of `ctypes` that quotes one.
 
     An interrupt during the conversion of an argument becomes such an error.
     """
@@ -84,13 +84,13 @@ def _names_interrupt(error: BaseException) -> bool:
 
 
 def is_closed_pipe(error: BaseException) -> bool:
-    """Return true if an error comes from a pipe whose reader has ended, such as `head`."""
+    """Return True if an error comes from a pipe whose reader has ended, such as `head`."""
     return any(isinstance(cause, BrokenPipeError) for cause in _causes(error))
 
 
 def is_disk_full(error: BaseException) -> bool:
-    """Return true if an error comes from a full disk, a quota or a limit on the size of files."""
-    return any(isinstance(e, OSError) and e.errno in _FULL_DISK_ERRORS for e in _causes(error))
+    """Return True if an error comes from a full disk, a quota or a limit on the size of files."""
+    return any(isinstance(e, OSError) and e.errno in _DISK_FULL for e in _causes(error))
 
 
 def _extra_of(error: ModuleNotFoundError) -> str:

@@ -39,7 +39,7 @@ _DESCRIPTION_FILES = {CONFIG, _METADATA, _LOCK}
 _RETRY_S = 0.2
 _HOLDER_CHARACTERS = 200
 """Longest text that is read from a lock file [characters]; it names the process."""
-_RECORDED_PACKAGES = "elastic-env mujoco gymnasium pin numpy scipy stable-baselines3 torch"
+_PACKAGES = "elastic-env mujoco gymnasium pin numpy scipy stable-baselines3 torch"
 """Packages whose versions a run records."""
 
 
@@ -70,7 +70,7 @@ def _write_metadata(folder: Path, content: dict[str, Any], results: list[str]) -
 
 
 def _recorded_results(folder: Path) -> list[str]:
-    """Return the names of recorded files in a folder, which may come from anybody."""
+    """Return the names of recorded files in a folder, which others may have made."""
     try:
         content = read_json(folder / _METADATA, LARGEST_JSON, missing=str)
     except ConfigurationError:
@@ -98,8 +98,8 @@ def require_run(folder: Path) -> Path:
             mode = path.lstat().st_mode
             if stat.S_ISLNK(mode) and leads_out(path, folder):
                 raise ConfigurationError(
-                    f"{path} is a link that leads out of {folder}, where nothing is to be changed;"
-                    " remove it"
+                    f"{path} is a link that leads out of {folder}, where nothing is to"
+                    " be changed; remove it"
                 )
             if not (stat.S_ISLNK(mode) or stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
                 problem = f"{path} is neither a file nor a folder, as all of a run are; remove it"
@@ -118,7 +118,7 @@ def create_folder(name: str, output: Path | None = None) -> Path:
         SystemFailedError: The folder cannot be made.
     """
     try:
-        return _numbered_folder(require_name(name)) if output is None else _empty_folder(output)
+        return _numbered_folder(name) if output is None else _empty_folder(output)
     except OSError as error:
         place = RUNS if output is None else output
         cause = f"{shorten(error.filename or place)}: {error.strerror or error}"
@@ -134,8 +134,8 @@ def require_name(name: str) -> str:
     """
     if name in ("", ".", "..") or any(sign in name for sign in "/\\\0"):
         raise ConfigurationError(
-            f"name must be the name of a folder in {RUNS}, without / and not . or .., got {name!r};"
-            " to write elsewhere, name a folder by --output"
+            f"name must be the name of a folder in {RUNS}, without / and not . or ..,"
+            f" got {name!r}; to write elsewhere, name a folder by --output"
         )
     return name
 
@@ -240,6 +240,7 @@ def _remove_without_result(folder: Path) -> Iterator[None]:
 
 def _numbered_folder(name: str) -> Path:
     """Make runs/<name>, or runs/<name>-<number>; `mkdir` succeeds for one program only."""
+    require_name(name)
     RUNS.mkdir(parents=True, exist_ok=True)
     for number in itertools.count(1):
         folder = RUNS / (name if number == 1 else f"{name}-{number}")
@@ -257,8 +258,8 @@ def _empty_folder(folder: Path) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     if names := sorted(path.name for path in folder.iterdir()):
         raise ResultsExistError(
-            f"{folder} already holds results ({', '.join(names[:3])}, ...), which are never"
-            " overwritten; name another folder, or leave --output out"
+            f"{folder} already holds results ({', '.join(names[:3])}, ...), which are"
+            " never overwritten; name another folder, or leave --output out"
         )
     return folder
 
@@ -271,7 +272,7 @@ def provenance(seed: int | None) -> dict[str, Any]:
         "commit": _commit(),
         "python": platform.python_version(),
         "platform": platform.platform(),
-        "versions": {name: installed_version(name) for name in _RECORDED_PACKAGES.split()},
+        "versions": {name: installed_version(name) for name in _PACKAGES.split()},
     }
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 
 def runs_in_workflow() -> bool:
-    """Return true if a workflow of GitHub runs this program."""
+    """Return True if a workflow of GitHub runs this program."""
     return os.environ.get("GITHUB_ACTIONS") == "true"
 
 

@@ -30,7 +30,7 @@ def remove_from_path(folder: Path) -> None:
     """
     here = os.path.realpath(folder)
     others = [entry for entry in sys.path if os.path.realpath(entry or ".") != here]
-    root = str(_ROOT)  # the finder of an editable installation comes after the whole path
+    root = str(_ROOT)  # an editable installation is searched after the whole path
     sys.path[:] = others if root in others else [*others, root]
     _require_own_packages()
 

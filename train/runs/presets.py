@@ -47,7 +47,7 @@ def find_configuration(path: Path, kind: str) -> Path:
         cure = f"the preset of this name needs no path: {command} {path.stem}"
         raise ConfigurationError(f"no configuration file at {shorten(path)}; {cure}")
     if path.suffix or path.name != name or path.exists():
-        return path  # whoever reads it raises the error
+        return path  # its reader raises the error
     close = difflib.get_close_matches(name, _presets_of_kind(kind), n=3)
     similar = f"similar presets are {', '.join(close)}; " if close else ""
     problem = f"no file and no preset is called {quote(name)}"
@@ -79,4 +79,4 @@ def first_sentence(file: Path) -> str:
 
 def _presets_of_kind(kind: str) -> dict[str, Path]:
     """Return the presets of a kind, by name."""
-    return {name: file for name, file in presets().items() if kind_of(read_mapping(file)) == kind}
+    return {n: f for n, f in presets().items() if kind_of(read_mapping(f)) == kind}

@@ -58,11 +58,12 @@ def plain_progress(
             is_estimated = True
             if remaining_s > _LONG_WORK_S:
                 console.print(f"  about {duration(remaining_s)} to go")
-        if int(10 * share) > printed_tenths and time.monotonic() - printed_s >= interval_s:
-            printed_tenths = int(10 * share)
+        tenths = int(10 * share)
+        if tenths > printed_tenths and time.monotonic() - printed_s >= interval_s:
+            printed_tenths = tenths
             printed_s = time.monotonic()
             details = f" of the {unit}, about {duration(remaining_s)} to go; {note}"
-            console.print(f"  {10 * printed_tenths} %{details if note else ''}")
+            console.print(f"  {10 * tenths} %{details if note else ''}")
 
     return show
 
@@ -109,7 +110,7 @@ def show_progress(
         progress.TextColumn("{task.fields[note]}", markup=False),
     )
     with progress.Progress(*columns, console=console, transient=transient) as bar:
-        tasks = [bar.add_task(name, start=False, total=n, note="") for name, n in totals.items()]
+        tasks = [bar.add_task(n, start=False, total=totals[n], note="") for n in totals]
 
         def draw(number: int, amount: int, note: str = "") -> None:
             bar.start_task(tasks[number])

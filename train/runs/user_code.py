@@ -26,13 +26,13 @@ from train.runs.import_path import append_to_path
 KINDS = {
     "comparison": (
         "elastic compare",
-        "references policies episodes scenario_episodes reference_scenarios figure_policies sweep"
-        " map groups leaderboard",
+        "references policies episodes scenario_episodes reference_scenarios"
+        " figure_policies sweep map groups leaderboard",
     ),
     "training": (
         "elastic train",
-        "weights base base_options settings algorithm algorithm_options anneal clip worlds"
-        " decisions seeds evaluate_every evaluation_episodes checkpoint_every",
+        "weights base base_options settings algorithm algorithm_options anneal clip"
+        " worlds decisions seeds evaluate_every evaluation_episodes checkpoint_every",
     ),
     "bench": ("elastic bench", "cases margin"),
 }
@@ -81,7 +81,7 @@ _ROOT = Path(__file__).parents[2]
 _OWN_FOLDERS = tuple(_ROOT / name for name in ("elastic_env", "baselines", "train"))
 _Refuse = Callable[[str], None]
 _CODE_CHECK: ContextVar[_Refuse] = ContextVar("code_check", default=lambda _: None)
-"""Is called with each name before its code runs."""
+"""Called with each name before its code runs."""
 _TRUST = "say --trust-code, or name a configuration of yours"
 """Cure for a user who trusts the folder of a run."""
 
@@ -147,7 +147,8 @@ def named_object(name: str) -> Any:
     source, _, attribute = name.rpartition(":")
     append_to_path(Path.cwd())
     try:
-        module = _import_file(Path(source)) if source.endswith(".py") else _import_module(source)
+        is_file = source.endswith(".py")
+        module = _import_file(Path(source)) if is_file else _import_module(source)
     except (Exception, SystemExit) as error:
         raise ConfigurationError(
             f"{shorten(source)} cannot be imported: {type(error).__name__}: {error}"
@@ -156,7 +157,7 @@ def named_object(name: str) -> Any:
         _require_unshadowed(module, attribute)
         functions = inspect.getmembers(module, inspect.isfunction)
         members = [*functions, *inspect.getmembers(module, inspect.isclass)]
-        names = [name for name, member in members if member.__module__ == module.__name__]
+        names = [n for n, member in members if member.__module__ == module.__name__]
         if not names:
             problem = f"{shorten(source)} has no {attribute!r}"
             raise ConfigurationError(f"{problem}, and no function or class of its own")
@@ -172,7 +173,7 @@ def user_line(error: BaseException) -> str:
     """
     frames = traceback.extract_tb(error.__traceback__)
     paths = [Path(frame.filename) for frame in frames]
-    foreign = [path.parent for path in paths if not any(map(path.is_relative_to, _OWN_FOLDERS))]
+    foreign = [p.parent for p in paths if not any(map(p.is_relative_to, _OWN_FOLDERS))]
     lines = [
         f" ({path.name}:{frame.lineno})"
         for frame, path in zip(frames, paths, strict=True)

@@ -93,7 +93,8 @@ class VectorLoop(_OurLoop):
         self.num_envs = num_envs
         self._condition = make_condition(env, policy)
         super().__init__(make_vector_env(self._condition, num_envs, threads, **backend))
-        self._policy = None if policy is None else make_policy(self._condition.policy, self.env)
+        spec = self._condition.policy
+        self._policy = None if policy is None else make_policy(spec, self.env)
         if residual:
             self._policy = untrained_residual(self._policy, self.env)
         self._state: Any = None
@@ -108,8 +109,8 @@ class VectorLoop(_OurLoop):
     @override
     def step(self) -> None:
         if self._policy is not None:
-            inputs = (self._observation, self._state, self._start)
-            self._action, self._state = self._policy.predict(*inputs, deterministic=True)
+            seen = (self._observation, self._state, self._start)
+            self._action, self._state = self._policy.predict(*seen, deterministic=True)
         self._observation, _, terminated, truncated, _ = self.env.step(self._action)
         # a world that ends starts again one step later
         self._start = self._done
@@ -154,11 +155,11 @@ class RawWorlds(Contender):
 
     @override
     def run(self, steps: int) -> float:
-        controls = self._loop.controls
+        controls = itertools.repeat(self._loop.controls)
         numbers = range(len(self._data))
         with ThreadPoolExecutor(len(numbers)) as threads:
             begin = time.perf_counter()
-            list(threads.map(self._play, numbers, itertools.repeat(controls)))
+            list(threads.map(self._play, numbers, controls))
         return self.num_envs * steps / (time.perf_counter() - begin)
 
     @override

@@ -78,9 +78,11 @@ class PPOLoop(Contender):
             venv: Any = SubprocVecEnv([maker] * num_envs, start_method="spawn")
         else:
             condition = make_condition(env, policy)
-            inner = make_vector_env(condition, num_envs, threads, AutoresetMode.SAME_STEP)
+            mode = AutoresetMode.SAME_STEP
+            inner = make_vector_env(condition, num_envs, threads, mode)
             base = make_policy(condition.policy, inner)
-            venv = SB3VecEnv(ResidualVectorWrapper(inner, base, acts_on=residual_input(base)))
+            residual = ResidualVectorWrapper(inner, base, acts_on=residual_input(base))
+            venv = SB3VecEnv(residual)
         self._period = ResidualSettings().decision_period
         torch.set_num_threads(1)
         self._rollout = max(PPO_DECISIONS // num_envs, 8)

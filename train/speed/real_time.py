@@ -24,7 +24,7 @@ def play_against_the_clock(
     """Record what a policy observes in an episode, then call it with that at the control rate.
 
     The loop requests real-time scheduling, as a motion on hardware does. If the episode is too
-    short, it starts again, and the policy without memory.
+    short, it starts again, with a policy that remembers nothing.
 
     Args:
         env_name: Name of the environment.
@@ -50,17 +50,17 @@ def play_against_the_clock(
         cycles = max(round(seconds / period_s), 1)
         with policy_errors(condition):
             steps = list(islice(control_steps(env, policy, seed=0), max(cycles - 1, 1)))
-            observations = [steps[0].seen, *(step.observation for step in steps)][:cycles]
+            observations = [steps[0].seen, *(s.observation for s in steps)][:cycles]
             is_real_time = realtime.prefer_realtime(realtime.Priority.LOOP)
             try:
-                latency_s, policy_s = _time_policy(policy, observations, cycles, period_s)
+                latency_s, policy_s = _measure(policy, observations, cycles, period_s)
             finally:
                 realtime.give_up_realtime()
     figures = summarise(period_s, latency_s, policy_s)
     return {"env": env_name, "policy": name, "is_real_time": is_real_time, **figures}
 
 
-def _time_policy(
+def _measure(
     policy: Any, observations: list[Any], cycles: int, period_s: float
 ) -> tuple[Array, Array]:
     """Return latency and time in the policy, (cycles,) [s]; cycles that begin late count too."""

@@ -14,21 +14,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from train.workers.pool import (
-    MAX_RETRIES,
-    CallFailedError,
-    ExecutorLostError,
-    Outcome,
-    Pool,
-    UnguardedScriptError,
-    WorkerKilledError,
-    WorkerLostError,
-)
+from train.workers import pool as workers
+from train.workers.pool import Outcome, Pool
 from train.workers.remote_call import run_remote_call
 from train.workers.versions import VersionsDifferError, everything
 
 _POLL_S = 0.2
-_FATAL = (VersionsDifferError, ExecutorLostError, UnguardedScriptError)
+_FATAL = (VersionsDifferError, workers.ExecutorLostError, workers.UnguardedScriptError)
 """Errors that end all calls."""
 
 
@@ -111,11 +103,11 @@ def run_calls(
 
     def submit(number: int) -> None:
         tries[number] += 1
-        settings = (Path.cwd(), everything(), pool.reporter)
+        context = (number, Path.cwd(), everything(), pool.reporter)
         try:
-            future = pool.submit(run_remote_call, function, arguments[number], number, *settings)
+            future = pool.submit(run_remote_call, function, arguments[number], *context)
         except RuntimeError as error:  # the pool was shut down
-            raise ExecutorLostError(f"the workers are gone: {error}") from None
+            raise workers.ExecutorLostError(f"the workers are gone: {error}") from None
         futures[future] = number
         future.add_done_callback(pool.events.put)
 
@@ -127,15 +119,15 @@ def run_calls(
     def end(number: int, outcome: Outcome) -> None:
         if isinstance(outcome.error, _FATAL):
             raise outcome.error
-        if isinstance(outcome.error, WorkerLostError):
+        if isinstance(outcome.error, workers.WorkerLostError):
             watch.tally.running.discard(number)
-            if interrupt.is_set():
+            if stop.is_set():
                 return
-            if tries[number] <= MAX_RETRIES:
+            if tries[number] <= workers.MAX_RETRIES:
                 watch.on_move(number)
                 submit(number)
                 return
-            outcome = Outcome(error=WorkerKilledError())
+            outcome = Outcome(error=workers.WorkerKilledError())
         outcomes[number] = outcome
         watch.tally.end(number, outcome)
         watch.on_end(number, outcome)
@@ -145,11 +137,11 @@ def run_calls(
             watch.tally.running.add(number)
         watch.on_report(number, value)
 
-    with _first_interrupt() if finishes else nullcontext(threading.Event()) as interrupt:
+    with _first_interrupt() if finishes else nullcontext(threading.Event()) as stop:
         for number in range(len(arguments)):
             submit(number)
         while futures:
-            if interrupt.is_set():
+            if stop.is_set():
                 cancel_waiting()
             with suppress(queue.Empty):
                 event = pool.events.get(timeout=_POLL_S)
@@ -164,13 +156,14 @@ def _outcome(future: Future[Any]) -> Outcome:
     """Return the outcome of a call whose future is done."""
     if future.cancelled():
         problem = "the workers are gone: they cancelled the waiting calls"
-        return Outcome(error=ExecutorLostError(problem))
+        return Outcome(error=workers.ExecutorLostError(problem))
     error = future.exception()
     if error is None:
         return future.result()
     if type(error).__name__ == "KilledWorker":  # of dask, which moves calls itself
-        return Outcome(error=WorkerKilledError())
-    return Outcome(error=error if isinstance(error, Exception) else CallFailedError(repr(error)))
+        return Outcome(error=workers.WorkerKilledError())
+    is_exception = isinstance(error, Exception)
+    return Outcome(error=error if is_exception else workers.CallFailedError(repr(error)))
 
 
 @contextmanager

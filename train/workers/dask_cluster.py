@@ -75,9 +75,9 @@ def warn_of_public(address: str) -> None:
     public = [host for host in hosts if ipaddress.ip_address(host).is_global]
     if public:
         warnings.warn(
-            f"the dask scheduler at {public[0]} is at a public address, by plain TCP: whoever"
-            " reaches it runs code on all of its machines; start it with --host and an address"
-            " within your network, or 127.0.0.1 behind ssh",
+            f"the dask scheduler at {public[0]} is at a public address, by plain TCP:"
+            " whoever reaches it runs code on all of its machines; start it with --host"
+            " and an address within your network, or 127.0.0.1 behind ssh",
             UserWarning,
             stacklevel=2,
         )

@@ -16,13 +16,13 @@ from multiprocessing.connection import Connection
 from typing import Any
 
 from train.runs.import_path import isolate_children
-from train.workers.pool import CallFailedError, Outcome, Pool, UnguardedScriptError, WorkerLostError
+from train.workers import pool
 
 _SPAWN = multiprocessing.get_context("spawn")
 
 
 @contextmanager
-def local_pool(jobs: int) -> Iterator[Pool]:
+def local_pool(jobs: int) -> Iterator[pool.Pool]:
     """Open a pool of processes of this machine, which end with the context.
 
     Args:
@@ -36,7 +36,7 @@ def local_pool(jobs: int) -> Iterator[Pool]:
         resource_tracker.ensure_running()
     processes = _Processes(jobs)
     try:
-        yield Pool(processes.submit, _report, processes.events)
+        yield pool.Pool(processes.submit, _report, processes.events)
     finally:
         processes.end()
 
@@ -77,11 +77,11 @@ class _Processes:
         for worker in workers:
             worker.process.join()
 
-    def _run(self, call: tuple[Any, ...]) -> Outcome:
+    def _run(self, call: tuple[Any, ...]) -> pool.Outcome:
         """Run a call in an idle process or a new one; a thread executes this method."""
         with self._lock:  # no process starts after `end`
             if self._is_closed:
-                raise WorkerLostError("the workers have been ended")
+                raise pool.WorkerLostError("the workers have been ended")
             worker = self._idle.pop() if self._idle else _Worker()
             self._workers.add(worker)
         try:
@@ -118,7 +118,7 @@ class _Worker:
         end.close()  # so that the pipe ends when the process does
         self._has_begun = False
 
-    def run(self, call: tuple[Any, ...], events: "queue.SimpleQueue[Any]") -> Outcome:
+    def run(self, call: tuple[Any, ...], events: "queue.SimpleQueue[Any]") -> pool.Outcome:
         """Run a call, put its reports into a queue, and return its outcome.
 
         Raises:
@@ -127,19 +127,19 @@ class _Worker:
             UnpicklingError: A report or the outcome cannot be read here.
         """
         self.pipe.send(call)
-        while not isinstance(message := _unpickle(self.pipe.recv_bytes()), Outcome):
+        while not isinstance(message := _unpickle(self.pipe.recv_bytes()), pool.Outcome):
             self._has_begun = True
             events.put(message)
         return message
 
     def loss(self) -> Exception:
         """Return the error of a call that was lost with the process."""
-        # the exit code may come later than the end of the pipe
+        # the pipe ends before the exit code is known, or another thread is about to set it
         while (code := self.process.exitcode) is None:
             time.sleep(0.01)
         if self._has_begun or code < 0:
-            return WorkerLostError("a worker process was killed")
-        return UnguardedScriptError()
+            return pool.WorkerLostError("a worker process was killed")
+        return pool.UnguardedScriptError()
 
 
 def _unpickle(content: bytes) -> Any:
@@ -186,7 +186,7 @@ def _serve(pipe: "Connection[Any, Any]") -> None:
             except EOFError:
                 return
             except BaseException as error:  # the user's code ends the process
-                pipe.send(Outcome(error=CallFailedError(repr(error))))
+                pipe.send(pool.Outcome(error=pool.CallFailedError(repr(error))))
 
 
 def _end_with_parent() -> None:

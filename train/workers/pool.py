@@ -27,8 +27,8 @@ class WorkerKilledError(SystemFailedError):
 
     def __init__(self) -> None:
         super().__init__(
-            "a worker process was killed each time that it was tried, most often for lack of"
-            " memory; take fewer --jobs or more memory"
+            "a worker process was killed each time that it was tried, most often for"
+            " lack of memory; take fewer --jobs or more memory"
         )
 
 

@@ -123,7 +123,8 @@ class _Jobs:
                 self._set_results()
             except Exception as error:
                 # Slurm refuses, or the folder is full: all calls end
-                lost = ExecutorLostError(f"jobs cannot be submitted or followed: {error}")
+                problem = f"jobs cannot be submitted or followed: {error}"
+                lost = ExecutorLostError(problem)
                 for future in [*self._jobs, *(future for future, _ in self._waiting)]:
                     if not future.cancelled():
                         future.set_exception(lost)
@@ -163,4 +164,5 @@ def _set_result(future: "Future[Any]", job: Any) -> None:
     try:
         future.set_result(job.result())
     except Exception as error:  # the job was killed, or out of time or memory
-        future.set_exception(WorkerLostError(f"job {job.job_id} ended without a result: {error}"))
+        problem = f"job {job.job_id} ended without a result: {error}"
+        future.set_exception(WorkerLostError(problem))

@@ -43,7 +43,7 @@ def require_same(ours: _Versions, theirs: _Versions, where: str) -> None:
     """
     names = dict.fromkeys([*ours, *theirs])
     differing = [name for name in names if ours.get(name) != theirs.get(name)]
-    differences = [f"{name} {theirs.get(name)} there, {ours.get(name)} here" for name in differing]
+    differences = [f"{k} {theirs.get(k)} there, {ours.get(k)} here" for k in differing]
     if differences:
         raise VersionsDifferError(
             f"all machines must have the same versions, but on {where} they differ:"
@@ -58,7 +58,7 @@ def _library_versions() -> dict[str, str]:
 
 
 def _digest(folders: Sequence[str]) -> str:
-    """Return 16 characters of the SHA-256 digest of modules and tables in some folders."""
+    """Return the first 16 characters of the SHA-256 of modules and tables in some folders."""
     digest = hashlib.sha256()
     for folder in folders:
         for file in sorted((_ROOT / folder).rglob("*")):

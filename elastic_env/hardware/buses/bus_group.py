@@ -88,7 +88,7 @@ class BusGroup:
         calls = [partial(_call, bus.confirm_torque_off) for bus in self.buses]
         answers = self._call_all(calls)
         errors = [answer for answer in answers if isinstance(answer, HardwareError)]
-        silent = [name for answer in answers if isinstance(answer, list) for name in answer]
+        silent = [name for names in answers if isinstance(names, list) for name in names]
         problems = [str(error) for error in errors]
         if silent:
             cure = f"{', '.join(silent)}: switch the power off"

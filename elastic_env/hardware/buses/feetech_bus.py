@@ -32,10 +32,12 @@ class FeetechBus(ServoBus):
 
     @override
     def _identify(self, servo_id: int, answer: bytes) -> ServoInfo:
-        table = next(m for m in servo_models().values() if m.protocol == "feetech").table
+        models = servo_models().values()
+        table = next(model.table for model in models if model.protocol == "feetech")
         first, last = (table[name] for name in _IDENTITY)
         length = last.end - first.address
-        reply = self._request(servo_id, packets.READ, self._place(first.address, length), length)
+        place = self._place(first.address, length)
+        reply = self._request(servo_id, packets.READ, place, length)
         return ServoInfo(servo_id, int.from_bytes(reply[-2:], "little"), reply[0])
 
     @override

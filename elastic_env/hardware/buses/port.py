@@ -53,9 +53,9 @@ def bus_gone(port: str) -> Iterator[None]:
         yield
     except (serial.SerialException, OSError, termios.error) as error:
         raise BusGoneError(
-            f"the bus at {port} is gone ({_reason(error)}): unplugged, or its adapter failed. Its "
-            "servos may be under torque: at their last goal, or where a bus watchdog has stopped "
-            "them. Switch their power off"
+            f"the bus at {port} is gone ({_reason(error)}): unplugged, or its adapter "
+            "failed. Its servos may be under torque: at their last goal, or where a "
+            "bus watchdog has stopped them. Switch their power off"
         ) from None
 
 

@@ -276,15 +276,15 @@ class ServoBus(PacketLine):
             return free[0]
         return next(filter(model.has_temperature, free), free[0])
 
-    def _decode(self, block: range, replies: dict[int, bytes], alerts: set[int]) -> States:
+    def _decode(self, block: range, data: dict[int, bytes], alerts: set[int]) -> States:
         """States of all servos, from the data of a block by id."""
         values = np.full((len(self.ids), 4), np.nan)
         for row, (servo_id, model) in enumerate(self.models.items()):
-            if servo_id in replies:
-                values[row] = model.decode_block(block, replies[servo_id])
+            if servo_id in data:
+                values[row] = model.decode_block(block, data[servo_id])
         angle, velocity, current, temperature = values.T.copy()
         torque = servo_models.torque_of_current(current, *self._torque_lines)
         now = self.port.clock.monotonic()
-        is_fresh = np.array([servo_id in replies for servo_id in self.ids])
+        is_fresh = np.array([servo_id in data for servo_id in self.ids])
         has_alert = np.array([servo_id in alerts for servo_id in self.ids])
         return States(angle, velocity, torque, is_fresh, has_alert, now, temperature)

@@ -119,7 +119,7 @@ class ControlTable(dict[str, Register]):
 
     @functools.cached_property
     def _by_address(self) -> dict[int, Register]:
-        return {at: entry for entry in self.values() for at in range(entry.address, entry.end)}
+        return {at: row for row in self.values() for at in range(row.address, row.end)}
 
     @property
     def size(self) -> int:
@@ -226,7 +226,7 @@ class ServoModel:
 
         The temperature is nan if the block contains none.
         """
-        position, velocity, load = (self._decode(name, block, data) for name in self._motion)
+        position, velocity, load = (self._decode(n, block, data) for n in self._motion)
         degrees = math.nan
         if self.has_temperature(block):
             degrees = self._decode(_TEMPERATURE, block, data)
@@ -299,11 +299,11 @@ def servo_models() -> dict[int, ServoModel]:
 @functools.cache
 def _read_table(file: str) -> ControlTable:
     """Read a control table from its file."""
-    return ControlTable({register.name: register for register in _read_rows(Register, file)})
+    return ControlTable({row.name: row for row in _read_rows(Register, file)})
 
 
 def _read_rows(kind: type[Row], file: str) -> list[Row]:
     """Read a table in this folder as objects of a class; empty cells take its defaults."""
     parse = TypeAdapter(kind).validate_python
     rows = read_rows(Path(__file__).with_name(file))
-    return [parse({column: cell for column, cell in row.items() if cell}) for row in rows]
+    return [parse({name: cell for name, cell in row.items() if cell}) for row in rows]

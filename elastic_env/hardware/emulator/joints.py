@@ -47,7 +47,7 @@ class ServoJoints:
         self._simulation = simulate(model, worlds, num_threads=1)
         self._at = JointAddresses.of(model, joints)
         self._world: IntArray = np.arange(n) * int(worlds > 1)
-        self._actuator = np.array([model.actuator(servo_name(name)).id for name in joints])
+        self._actuator = np.array([model.actuator(servo_name(j)).id for j in joints])
         self._force = self._simulation.bind("actuator_force")
         self._range = self._simulation.vary("actuator_forcerange")
         self._torque_limits = [servo.torque_limit for servo in servos]
@@ -109,9 +109,9 @@ class ServoJoints:
         self._simulation.advance(steps)
         if not np.isfinite(self._simulation.qpos).all():
             raise ConfigurationError(
-                "the emulated joints diverge: a spring is too stiff for the inertia and the damping"
-                " that the joints file gives it; lower its stiffness, or raise its damping or"
-                " rotor_inertia"
+                "the emulated joints diverge: a spring is too stiff for the inertia and"
+                " the damping that the joints file gives it; lower its stiffness, or"
+                " raise its damping or rotor_inertia"
             )
 
 
@@ -130,8 +130,8 @@ class Joints(ServoJoints):
             raise ConfigurationError("an emulated joint needs a servo, got None")
         if joint.servo.motor is not None:
             raise ConfigurationError(
-                "an emulated servo controls its current, so that it has no motor; leave `motor` of"
-                " its servo out, or emulate an arm"
+                "an emulated servo controls its current, so that it has no motor; leave"
+                " `motor` of its servo out, or emulate an arm"
             )
         spec = elastic_spec(config.true_pendulum, joint, config.form, config.timestep_s)
         n = num_joints
@@ -163,7 +163,8 @@ class EmulatedArm(Model):
 class ArmJoints(ServoJoints):
     """An arm that rests until torque goes on for the first time.
 
-    Angles are those of the servos. A servo measures the torque of its duty cycle at rest.
+    Angles are those of the servos. A servo measures the torque that its duty cycle would give at
+    rest.
 
     Args:
         arm: The arm.
@@ -174,16 +175,15 @@ class ArmJoints(ServoJoints):
     """
 
     def __init__(self, arm: EmulatedArm, start_s: float) -> None:
-        home = arm.home or None
-        config = configure_robot(arm.model, arm.joints, "hold", home=home)
+        config = configure_robot(arm.model, arm.joints, "hold", home=arm.home or None)
         joints: dict[str, ElasticJoint] = config.true_joints
         for name in arm.order:
             if name not in joints or joints[name].servo is None:
                 raise ConfigurationError(
-                    f"joint {name!r} cannot be emulated: it must be elastic and have a servo; the"
-                    f" elastic joints are {', '.join(joints)}"
+                    f"joint {name!r} cannot be emulated: it must be elastic and have a"
+                    f" servo; the elastic joints are {', '.join(joints)}"
                 )
-        servos = [servo for name in arm.order if (servo := joints[name].servo) is not None]
+        servos = [s for name in arm.order if (s := joints[name].servo) is not None]
         spec = config.robot.elastic(config)
         spec.option.timestep = _ARM_STEP_S
         spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
@@ -207,7 +207,8 @@ class ArmJoints(ServoJoints):
 
     @override
     def command(self, index: int, angle: float) -> None:
-        super().command(index, float(self._direction[index] * (angle - self._zero[index])))
+        turn = angle - self._zero[index]
+        super().command(index, float(self._direction[index] * turn))
 
     @override
     def set_torque(self, index: int, share: float) -> None:

@@ -122,8 +122,8 @@ class EmulatorConfig(Model):
             _ = model.table[name]
         if self.arm is not None and len(self.arm.order) != len(self.ids):
             raise ValueError(
-                f"an emulated arm needs one id for each of its joints, got {len(self.ids)} ids for"
-                f" {len(self.arm.order)} joints"
+                "an emulated arm needs one id for each of its joints, got"
+                f" {len(self.ids)} ids for {len(self.arm.order)} joints"
             )
         if not hasattr(termios, f"B{self.rate}"):
             raise ValueError(
@@ -164,8 +164,8 @@ class RunningEmulator(AbstractContextManager["RunningEmulator"]):
     def events(self) -> list[tuple[float, int, str, int]]:
         """Switches, goals and requests for states since the last call.
 
-        Each is monotonic time [s], id, register and value [count]; `present_position` stands for a
-        request of states, with the true position.
+        Each is monotonic time [s], id, register and value [count]; `present_position` marks a
+        request of states, with the position in the reply.
         """
         return [tuple(event) for event in self._request({"events": True})]
 

@@ -139,7 +139,7 @@ class Emulator:
         is_idle = not self._replies and now >= self._settled_s
         for servo in self._servos:
             servo.watch(now)
-        has_instruction = self.bus_terminal is not None and self.bus_terminal.master in ready
+        has_instruction = any(source != control for source in ready)
         if has_instruction:
             now = self.answer_instructions()
         # after the answers, which are urgent
@@ -240,9 +240,8 @@ class Emulator:
 
     def _collide(self, reply: bytes) -> bytes:
         """Mix a reply with that of a second servo, if two have the first id; low bits win."""
-        first = self._servos[0].servo_id
         at = {"dynamixel": 4, "feetech": 2}[self._servos[0].model.protocol]
-        if not self.faults.same_id or reply[at] != first:
+        if not self.faults.same_id or reply[at] != self._servos[0].servo_id:
             return reply
         return reply[:-4] + bytes(byte & _COLLISION_MASK for byte in reply[-4:])
 

@@ -3,9 +3,9 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
-from elastic_env.hardware.buses import feetech_packets, packets
+from elastic_env.hardware.buses import feetech_packets, packets, servo_models
 from elastic_env.hardware.buses.packets import Packet, word
-from elastic_env.hardware.buses.servo_models import OVERLOAD, Protocol, Register, ServoModel
+from elastic_env.hardware.buses.servo_models import Protocol, Register, ServoModel
 
 Notify = Callable[[int, str, int], None]
 
@@ -96,7 +96,7 @@ class EmulatedServo:
 
     def overload(self, is_overloaded: bool) -> None:
         """Begin or end an overload: the status shows it, and torque goes off."""
-        self["hardware_error_status"] = OVERLOAD if is_overloaded else 0
+        self["hardware_error_status"] = servo_models.OVERLOAD if is_overloaded else 0
         if is_overloaded and self.is_on:
             self._change("torque_enable", 0)
 
@@ -274,8 +274,8 @@ class EmulatedBus:
         match packet.instruction:
             case packets.SYNC_READ:
                 place = self.wire.place(parameters)
-                chosen = [self.servos[i] for i in parameters[begin:] if i in self.servos]
-                return [self.wire.status(servo, *servo.read_memory(*place)) for servo in chosen]
+                named = [self.servos[i] for i in parameters[begin:] if i in self.servos]
+                return [self.wire.status(s, *s.read_memory(*place)) for s in named]
             case packets.SYNC_WRITE:
                 address, length = self.wire.place(parameters)
                 for at in range(begin, len(parameters) - length, length + 1):

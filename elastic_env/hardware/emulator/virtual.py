@@ -15,7 +15,6 @@ import numpy as np
 from elastic_env.core.signals import Array
 from elastic_env.hardware import errors
 from elastic_env.hardware.buses.protocols import BUSES
-from elastic_env.hardware.buses.servo_bus import ServoBus
 from elastic_env.hardware.buses.servo_models import servo_model
 from elastic_env.hardware.clock import Clock
 from elastic_env.hardware.emulator.launch import EmulatorConfig
@@ -111,7 +110,8 @@ class VirtualBus(AbstractContextManager["VirtualBus"]):
         self.clock: Clock = self
         self._ahead_s = -np.inf
         self.emulator = Emulator(config, self, _Wire)
-        self.driver: ServoBus = BUSES[servo_model(config.model_number).protocol](_NAME, config.rate)
+        protocol = servo_model(config.model_number).protocol
+        self.driver = BUSES[protocol](_NAME, config.rate)
         self.driver.port.clock = self
         self.driver.port.use(_Line(self.emulator, self))
         self.driver.attach(config.ids)
@@ -141,8 +141,8 @@ class VirtualBus(AbstractContextManager["VirtualBus"]):
 
     def enable(self, limits: SafetyLimits, ranges: Array) -> Array:
         """Switch torque on, see `SupervisedBus.enable`."""
-        answer = self._request("enable", limits=limits.model_dump(), ranges=ranges.tolist())
-        return np.array(answer["position"])
+        arguments = {"limits": limits.model_dump(), "ranges": ranges.tolist()}
+        return np.array(self._request("enable", **arguments)["position"])
 
     def exchange(self, goals: Array, at: float) -> Cycle:
         """Run one control cycle, see `SupervisedBus.exchange`."""

@@ -103,7 +103,8 @@ class Arm:
         with self._name_joints_in_errors():
             positions = self._bus.enable(self.settings.limits, self._ranges)
         # weight may press a joint that rests on a stop beyond its range; no command may lie there
-        self.start = np.clip(self.servos.joint_angle(positions), self._lowest, self._highest)
+        angles = self.servos.joint_angle(positions)
+        self.start = np.clip(angles, self._lowest, self._highest)
         self.follower = self._follower(self.start)
         self._command = self.start
         self._begin_s = self._bus.clock.monotonic()
@@ -200,9 +201,9 @@ class Arm:
             cycle = self._bus.exchange(self.servos.servo_angle(command), due_s)
         late_s = self._pace.late(due_s + cycle.late_s)
         states = cycle.states
-        is_known = np.isfinite(states.temperature)
-        if is_known.shape:
-            self._temperature = np.where(is_known, states.temperature, self._temperature)
+        known = np.isfinite(states.temperature)
+        if known.shape:
+            self._temperature = np.where(known, states.temperature, self._temperature)
         theta = self.servos.joint_angle(states.position)
         self._command = self.servos.joint_angle(cycle.goals)
         self.counts.cycles += 1

@@ -67,7 +67,8 @@ def state_message(state: ArmState, joints: Sequence[str]) -> dict[str, object]:
         return {name: float(value) if math.isfinite(value) else None for name, value in pairs}
 
     signals = ("theta", "link", "torque", "temperature")
-    return {"time_s": state.time_s, **{name: by_joint(getattr(state, name)) for name in signals}}
+    values = {name: by_joint(getattr(state, name)) for name in signals}
+    return {"time_s": state.time_s, **values}
 
 
 def live_table(state: ArmState, joints: Sequence[str], counts: Counts, targets: Targets) -> str:
@@ -79,8 +80,8 @@ def live_table(state: ArmState, joints: Sequence[str], counts: Counts, targets: 
         error = 1e3 * (state.link[i] - state.target[i])
         mark = " *" if state.is_limited[i] else ""
         lines.append(
-            f"{name:{width}} {state.target[i]:+8.4f} {state.link[i]:+8.4f} {error:+6.0f}"
-            f" {state.torque[i]:+6.2f} {state.temperature[i]:5.0f}{mark}"
+            f"{name:{width}} {state.target[i]:+8.4f} {state.link[i]:+8.4f}"
+            f" {error:+6.0f} {state.torque[i]:+6.2f} {state.temperature[i]:5.0f}{mark}"
         )
     lines.append(
         f"{state.time_s:.1f} s, target {targets.number}, {counts.cycles} cycles, {counts.late}"
@@ -100,11 +101,7 @@ class ArmLog:
 
     def __init__(self, file: TextIO, joints: Sequence[str]) -> None:
         self._writer = csv.writer(file, lineterminator="\n")
-        columns = [
-            f"{signal}.{joint} [{_UNITS.get(signal, 'rad')}]"
-            for signal in _LOGGED
-            for joint in joints
-        ]
+        columns = [f"{name}.{j} [{_UNITS.get(name, 'rad')}]" for name in _LOGGED for j in joints]
         self._writer.writerow(["time [s]", *columns, "late [s]", "held [1]", "target [1]"])
 
     def write(self, state: ArmState, number: int) -> None:

@@ -65,8 +65,7 @@ class HardwareTestbedTask(JointTask):
     def __init__(self, config: TestbedConfig, settings: HardwareSettings) -> None:
         # the IMU is read in every cycle
         period_s = config.control_period_s
-        imu = AttitudeSensor(rate_hz=1.0 / period_s)
-        scenario = config.scenario.replace(imu=imu)
+        scenario = config.scenario.replace(imu=AttitudeSensor(rate_hz=1.0 / period_s))
         super().__init__(config.replace(scenario=scenario), num_worlds=1)
         self.metrics = (*METRICS_OF_ONE, *TIMING_METRICS)
         at = JointAddresses.of(self.model, self.assumed_model.joint_names)
@@ -109,8 +108,7 @@ class HardwareTestbedTask(JointTask):
 
     def _signals(self, joints: Records, worlds: Records) -> Signals:
         """Signals of a step, with those of its cycle."""
-        cycle = worlds["cycle"]
-        timing = {name: cycle[name].copy() for name in _CYCLE.names or ()}
+        timing = {name: worlds["cycle"][name].copy() for name in _CYCLE.names or ()}
         return {**super()._signals(joints, worlds), **timing}
 
     @property
@@ -143,16 +141,16 @@ def configure_hardware(port: Any = None, **arguments: Any) -> HardwareTestbedTas
     if port is None:
         cure = "such as /dev/ttyUSB0; see: elastic hardware scan PORT"
         raise ConfigurationError(f"{ID} needs port, {cure}")
-    settings_names = list(HardwareSettings.model_fields)
+    fields = list(HardwareSettings.model_fields)
     parameters = inspect.signature(configure_testbed).parameters
     testbed_names = [name for name in parameters if name not in _SIMULATION_ONLY]
-    require_known(f"argument of {ID}", arguments, [*settings_names, *testbed_names])
+    require_known(f"argument of {ID}", arguments, [*fields, *testbed_names])
     scenario = arguments.pop("scenario", SCENARIO)
     if scenario not in (SCENARIO, "nominal"):
         raise HardwareError(
             f"scenarios are for simulations; hardware has none, got {quote(scenario)}"
         )
-    settings = {name: arguments.pop(name) for name in settings_names if name in arguments}
+    settings = {name: arguments.pop(name) for name in fields if name in arguments}
     config = configure_testbed(scenario="ideal", **arguments)
     return HardwareTestbedTask(config, HardwareSettings(port=port, **settings))
 
@@ -160,7 +158,8 @@ def configure_hardware(port: Any = None, **arguments: Any) -> HardwareTestbedTas
 def make(render_mode: str | None = None, **arguments: Any) -> ElasticEnv:
     """Make the environment; arguments as in `configure_hardware`."""
     task = configure_hardware(**arguments)
-    return ElasticEnv(task, render_mode, partial(TestbedPicture, task.config.pendulum), task.plant)
+    picture = partial(TestbedPicture, task.config.pendulum)
+    return ElasticEnv(task, render_mode, picture, task.plant)
 
 
 def make_vector(

@@ -54,7 +54,7 @@ def check_joint(arm: Arm, joint: int, way_rad: float) -> JointCheck:
     load.
 
     Args:
-        arm: Under torque.
+        arm: Arm under torque.
         joint: Index of the joint.
         way_rad: Move to either side [rad].
 
@@ -77,12 +77,11 @@ def check_joint(arm: Arm, joint: int, way_rad: float) -> JointCheck:
         )
     command, theta, torque = 0.5 * (far + near)
     sag = command - theta
-    gain = torque / sag if abs(sag) > _LEAST_SAG_RAD else np.nan
     return JointCheck(
         first_move=off_stops + side,
         follow_ratio=follow_ratio,
         torque=float(torque),
-        gain=float(gain),
+        gain=float(torque / sag if abs(sag) > _LEAST_SAG_RAD else np.nan),
         theta=0.5 * (theta_far + theta_near),
     )
 
@@ -108,8 +107,8 @@ def require_signs(
     expected = gravity_torque(theta)
     measured = np.array([check.torque for check in checks])
     loads = zip(servos.joints, expected.tolist(), strict=True)
-    bounds = np.array([friction_torque_bound(settings[name], load) for name, load in loads])
-    wrong = wrong_sign(measured, theta, gravity_torque, bounds)
+    bounds = [friction_torque_bound(settings[name], load) for name, load in loads]
+    wrong = wrong_sign(measured, theta, gravity_torque, np.array(bounds))
     if wrong is not None:
         raise HardwareError(
             f"joint {servos.joints[wrong]!r} holds {measured[wrong]:+.2f} N·m where the model says"

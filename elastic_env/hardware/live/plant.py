@@ -288,8 +288,8 @@ class ServoPlant:
         moved = abs(float(self.qvel[0, self._at.theta_dot[0]])) * max(age_s, 0.0)
         if exceeds(abs(deflection), settings.largest_deflection_rad + moved):
             raise HardwareError(
-                f"the link, by the IMU at {settings.imu_port}, is {deflection:+.2f} rad from the "
-                "servo's angle, more than largest_deflection_rad "
+                f"the link, by the IMU at {settings.imu_port}, is {deflection:+.2f} "
+                "rad from the servo's angle, more than largest_deflection_rad "
                 f"{settings.largest_deflection_rad:g}: correct imu_sign, imu_axis and "
                 "imu_offset_rad of the mounting, or check what has come loose"
             )

@@ -146,8 +146,7 @@ def read_targets(
 
 def _joint_name(column: str) -> str:
     """Joint of a column; logs of poses have columns such as `theta.elbow [rad]`."""
-    name = column.partition("[")[0].strip()
-    return name.removeprefix("theta.").removeprefix("q.")
+    return column.partition("[")[0].strip().removeprefix("theta.").removeprefix("q.")
 
 
 def require_in_range(
@@ -176,6 +175,6 @@ def require_in_range(
         cure = "the angles look like degrees: convert them to radians"
     raise ConfigurationError(
         f"{source}: the target {rows[row, column]:g} rad of joint {joints[column]!r}"
-        f" (row {row + 1}) lies beyond its range of {lowest[column]:.4g} to {highest[column]:.4g}"
-        f" rad; {cure}"
+        f" (row {row + 1}) lies beyond its range of {lowest[column]:.4g} to"
+        f" {highest[column]:.4g} rad; {cure}"
     )

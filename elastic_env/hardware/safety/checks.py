@@ -26,8 +26,7 @@ _DELAY_UNIT_US = 2
 _WARM_SHARE = 0.8
 _PINGS = 50
 _MANY_LOST = 2
-"""Number of lost or damaged replies from which a line counts as bad; a busy computer may cost one.
-"""
+"""Lost or damaged replies from which a line counts as bad; a busy computer may cost one."""
 _FINE_SPEED = 1 << 2
 """Bit of Feetech's `phase` with which a count of velocity is 1 pulse/s, not 50."""
 _DELAY_CURE = (
@@ -35,8 +34,8 @@ _DELAY_CURE = (
     "and the bus to 1 Mbit/s or more"
 )
 _LINE_CURE = (
-    "a bad line: look at plugs, cable, ground and termination, and at what else keeps the computer "
-    "busy"
+    "a bad line: look at plugs, cable, ground and termination, and at what else keeps "
+    "the computer busy"
 )
 
 

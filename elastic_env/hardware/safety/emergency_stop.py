@@ -1,4 +1,4 @@
-"""Switching torque off without a supervisor, after that has died or was silent."""
+"""Torque off without a supervisor, after it has died or been silent."""
 
 import contextlib
 from collections.abc import Iterator, Mapping, Sequence

@@ -167,17 +167,16 @@ class Guard:
         behind = is_fresh & exceeds(distance, limits.following_error_rad)
         if behind.any():
             return (
-                f"a servo is further than {limits.following_error_rad:g} rad from its goal, "
-                f"blocked or overloaded: {self._list(behind, states.position)}, goal "
-                f"{np.round(self.goals[behind], 3).tolist()} rad"
+                f"a servo is further than {limits.following_error_rad:g} rad from its "
+                f"goal, blocked or overloaded: {self._list(behind, states.position)}, "
+                f"goal {np.round(self.goals[behind], 3).tolist()} rad"
             )
         return self._check_load(states) or self._check_heat(states.temperature)
 
     def _check_load(self, states: States) -> str:
         """Reason to stop by the torques, "" if there is none."""
         torque = np.abs(states.torque)
-        is_strained = exceeds(torque, self._strongest)
-        strained = np.where(is_strained, self._strained + 1, 0)
+        strained = np.where(exceeds(torque, self._strongest), self._strained + 1, 0)
         # a missing reply changes no count
         self._strained = np.where(states.is_fresh, strained, self._strained)
         too_long = states.is_fresh & (self._strained >= self.limits.patience_cycles)

@@ -47,7 +47,8 @@ def child_command(module: str, *arguments: str) -> list[str]:
     """
     names = dict.fromkeys((_PACKAGE, module.partition(".")[0]))
     folders = os.pathsep.join(str(_folder(name)) for name in names)
-    return [sys.executable, "-P", str(Path(__file__).resolve()), folders, module, *arguments]
+    this_file = str(Path(__file__).resolve())
+    return [sys.executable, "-P", this_file, folders, module, *arguments]
 
 
 def start_child(module: str, *arguments: str, **options: Any) -> Process:
@@ -84,7 +85,7 @@ def child_environment(environment: Mapping[str, str] = os.environ) -> dict[str, 
     """
     here = os.path.realpath(".")  # an empty entry means the same
     folders = environment.get(_PATH, "").split(os.pathsep)
-    entries = [folder for folder in folders if folder and os.path.realpath(folder) != here]
+    entries = [path for path in folders if path and os.path.realpath(path) != here]
     others = {name: value for name, value in environment.items() if name != _PATH}
     return {**others, _PATH: os.pathsep.join(entries)} if entries else others
 

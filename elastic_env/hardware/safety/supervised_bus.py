@@ -136,7 +136,7 @@ class SupervisedBus(contextlib.AbstractContextManager["SupervisedBus"]):
             The positions, (n,) [rad].
 
         Raises:
-            FaultError: A servo reports a hardware error, moves, or stands outside the limits.
+            FaultError: A servo reports a hardware error, moves, or is outside the limits.
             ReplyError: A servo does not answer, or refuses its position as goal.
             BusGoneError: The port is gone.
         """
@@ -144,7 +144,8 @@ class SupervisedBus(contextlib.AbstractContextManager["SupervisedBus"]):
         self._is_enabled = True
         self.is_confirmed_off = False
         ends = None if ranges is None else ranges.tolist()
-        answer = self._request("enable", self._slow_s, limits=limits.model_dump(), ranges=ends)
+        arguments = {"limits": limits.model_dump(), "ranges": ends}
+        answer = self._request("enable", self._slow_s, **arguments)
         self._answer_s = max(limits.hang_s, _LEAST_ANSWER_S)
         self._hint = limits.patience_hint("hang_s") or "; end what else keeps the computer busy"
         return np.array(answer["position"])
@@ -167,7 +168,7 @@ class SupervisedBus(contextlib.AbstractContextManager["SupervisedBus"]):
             self._is_enabled = False  # the message says whether torque is off
             raise
         except BaseException:
-            # torque off after an interrupted cycle, whatever its answer
+            # torque off after an interrupted cycle, for any answer
             with contextlib.suppress(HardwareError, OSError):
                 self._request("disable", _ANSWER_S)
             raise
@@ -201,7 +202,8 @@ class SupervisedBus(contextlib.AbstractContextManager["SupervisedBus"]):
         # the supervisor refuses to wait longer, or for a moment of nan; max gives 0 for nan as its
         # second value
         wait_s = min(max(0.0, at - time.monotonic()), LONGEST_WAIT_S)
-        return self._request("exchange", wait_s + self._answer_s, goals=goals.tolist(), at=at)
+        within_s = wait_s + self._answer_s
+        return self._request("exchange", within_s, goals=goals.tolist(), at=at)
 
     def disable(self) -> None:
         """Switch torque off.
