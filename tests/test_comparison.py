@@ -23,7 +23,7 @@ from baselines.catalogue import BEST_ON_THE_WALKER
 from baselines.residual.residual_folder import read_description
 from elastic_env.core.config import load_yaml
 from elastic_env.core.errors import ConfigurationError, MissingExtraError
-from tests.cells import METRIC, cell, describe, episode_rows, family, over_seeds, records
+from tests.cells import METRIC, cell, describe, episode_rows, family, records
 from train.commands.cli import main
 from train.commands.compare_config import CompareConfig
 from train.commands.comparison import _distinct_conditions
@@ -39,6 +39,7 @@ from train.evaluate.statistics import (
     change,
     improvement,
     interquartile_mean,
+    over_seeds,
 )
 from train.evaluate.table import EpisodeTable
 from train.evaluate.terms import CEILING, SAME_ROBOT, percent_interval

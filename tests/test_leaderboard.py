@@ -18,14 +18,14 @@ import train.speed.step_times
 from baselines.catalogue import Track
 from elastic_env.core.config import load_yaml
 from elastic_env.core.errors import ConfigurationError
-from tests.cells import METRIC, cell, family, over_seeds
+from tests.cells import METRIC, cell, family
 from train.commands.cli import main
 from train.commands.compare_config import CompareConfig, Sweep
 from train.evaluate.changes import changes
 from train.evaluate.conditions import Condition, PolicySpec
 from train.evaluate.episodes import Evaluation, evaluate
 from train.evaluate.standings import PairedChange, Standing, standings
-from train.evaluate.statistics import Estimate
+from train.evaluate.statistics import Estimate, over_seeds
 from train.report.leaderboard import (
     claims_table,
     find_published,

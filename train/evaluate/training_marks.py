@@ -26,16 +26,16 @@ def training_marks(origin: Origin | None, conditions: Sequence[Condition]) -> tu
     if motion is None:
         motion = environment.default_reference
     played_motion = _motion_label(environment, conditions[0].reference)
-    motion_is_known = _motion_label(environment, motion) == played_motion
+    is_same = _motion_label(environment, motion) == played_motion
     quantity = environment.quantity or "reference"
     scenarios = [_training_name(condition, origin) for condition in conditions]
     unseen = [scenario for scenario in scenarios if scenario not in origin.scenarios]
     if unseen:
         if len(unseen) == len(scenarios):
-            return (HELD_OUT if motion_is_known else f"{HELD_OUT} scenario and {quantity}",)
+            return (HELD_OUT if is_same else f"{HELD_OUT} scenario and {quantity}",)
         names = f": {', '.join(unseen)}"
-        return (f"{PARTLY}{names}" if motion_is_known else f"{HELD_OUT}{names} and {quantity}",)
-    if not motion_is_known:
+        return (f"{PARTLY}{names}" if is_same else f"{HELD_OUT}{names} and {quantity}",)
+    if not is_same:
         return (f"{HELD_OUT} {quantity}",)
     if conditions[0].swept:
         return ()
