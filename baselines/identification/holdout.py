@@ -97,7 +97,7 @@ class HoldoutProblem:
 
     @classmethod
     def from_geometry(cls, problem: GeometryProblem) -> "HoldoutProblem":
-        """Markers of an arm whose geometry is unknown too."""
+        """Problem of an arm with markers whose geometry is unknown too."""
 
         def fit(inner: GeometryProblem) -> PredictionError:
             result = fit_geometry(inner)
@@ -114,7 +114,7 @@ class HoldoutProblem:
 
     @classmethod
     def from_poses(cls, model: PoseModel) -> "HoldoutProblem":
-        """Measurement of an arm whose stiffness is unknown."""
+        """Problem of a measurement of an arm whose stiffness is unknown."""
         rigid = replace(model, unknowns=model.unknowns.frame_alone())
         part = model.log.part
 

@@ -136,7 +136,7 @@ class ServoProblem:
         return replace(self, replays=tuple(prepare(log, longest_s) for log in self.logs))
 
     def with_parts(self, seconds: float) -> "ServoProblem":
-        """Replays of short parts, each from the measured angle and speed at its first row.
+        """Problem of short parts, each replayed from measured angle and speed at its first row.
 
         A short replay deviates little with wrong parameters, so that its least squares have hardly
         any local minima [Bock1983]. A long replay then starts close to its own minimum.

@@ -144,8 +144,8 @@ def _opponents(
 
     The base has the same options. The rival is the best policy without learning that has the same
     sensors; None if that is the base. A rival among the policies counts if it assumes the same
-    stiffness, whatever its other options. If the base is the best policy with options, the residual
-    is compared with that policy without options if it plays.
+    stiffness; its other options do not count. If the base is the best policy with options, the
+    residual is compared with that policy without options if it plays.
 
     Args:
         description: Description of the residual.
