@@ -34,7 +34,7 @@ from baselines.walking.foot_tare import FootTare
 from baselines.walking.foothold import FootholdCorrection
 from baselines.walking.phase_table import PhaseFeedforward, load_phase_table
 from baselines.walking.posture import PostureFeedback, PostureGains
-from baselines.walking.refined_walk import RefinedWalk, refine_model
+from baselines.walking.refined_plan import RefinedWalk, refine_model
 from baselines.walking.standing_estimate import StandingEstimate
 from baselines.walking.talos import HipTorque
 from baselines.walking.thormang import FootBalance, StanceRoll

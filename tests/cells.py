@@ -11,6 +11,7 @@ import pandas as pd
 from baselines.residual.settings import ResidualDescription
 from train.evaluate.conditions import Condition, Member, PolicySpec
 from train.evaluate.episodes import Evaluation
+from train.evaluate.statistics import Estimate, estimate
 
 METRIC = "pelvis_error_rms_rad"
 
@@ -25,6 +26,11 @@ def records(values: Sequence[float | None], first: int = 0) -> list[dict[str, An
         }
         for i, value in enumerate(values)
     ]
+
+
+def over_seeds(values: Any) -> Estimate:
+    """Interquartile mean over training seeds, with its interval."""
+    return estimate(lambda _: np.asarray(values, dtype=np.float64)[None], ())
 
 
 def episode_rows(episodes: Sequence[dict[str, Any]]) -> pd.DataFrame:

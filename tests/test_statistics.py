@@ -8,7 +8,7 @@ import pytest
 from scipy import stats
 
 from elastic_env.core.signals import Array
-from tests.cells import METRIC, cell, family
+from tests.cells import METRIC, cell, family, over_seeds
 from train.evaluate import statistics
 from train.evaluate.changes import changes
 from train.evaluate.scores import over_cells, per_robot, score
@@ -24,7 +24,6 @@ from train.evaluate.statistics import (
     mean_of_robots,
     middle,
     middle_half,
-    over_seeds,
     worst_share,
 )
 from train.evaluate.table import EpisodeTable

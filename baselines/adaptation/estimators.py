@@ -39,7 +39,7 @@ from baselines.compensation.dry_friction import presliding_friction
 from baselines.compensation.gravity_torque import make_gravity
 from baselines.compensation.measured import DeflectionSensors
 from baselines.compensation.observation_view import ObservationView
-from baselines.estimation.bending import BendingObserver
+from baselines.estimation.model_error import BendingObserver
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array, SignalTable
 from elastic_env.world.robot_model import RobotModel, WalkerModel

@@ -15,8 +15,8 @@ center of mass, h over the ankles. Set upright, it gives the wrenches of level g
 .. math:: f' = R f, \qquad m' = m + h \hat z \times (f' - f)
 
 A leaning weight bends the legs further than an upright one, s and s' by the model
-(`baselines.estimation.bending`), each leg by its share w of the load. Level ground excludes that
-too, so that the robot's own tilt is
+(`baselines.estimation.model_error`), each leg by its share w of the load. Level ground excludes
+that too, so that the robot's own tilt is
 
 .. math:: \text{attitude} - \lambda - \sum_{legs} w (s - s')
 
@@ -29,7 +29,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from baselines.compensation.policy import filter_share
-from baselines.estimation.bending import LOADED_SHARE, BendingObserver
+from baselines.estimation.model_error import LOADED_SHARE, BendingObserver
 from elastic_env.core.signals import Array, rename_group
 from elastic_env.rigid.leg_kinematics import rotation_of_tilt
 from elastic_env.world.robot_model import WalkerModel

@@ -10,7 +10,7 @@
 | `zmp_error` | walker: measured ZMP of flat feet less the planned one [m], whatever the ground's tilt adds |
 | `zmp_of_steps` | walker: mean `zmp_error` in the last step on either foot |
 | `level` | walker: attitude and foot wrenches as on level ground (`baselines.estimation.ground_level`) |
-| `bending` | walker: relative error of the model's bending, and the load (`baselines.estimation.bending`) |
+| `bending` | walker: relative error of the model's bending, and the load (`baselines.estimation.model_error`) |
 | `phase` | walker: the first eight harmonics of the phase of a step [1] |
 | `standing`, `zmp_offset`, `feet`, `landing`, `shear` | estimates of the robot by a base such as `foothold`, from its memory |
 | `base_action` | present command of the base alone [rad] |
@@ -25,8 +25,8 @@ import numpy as np
 
 from baselines.compensation.memory import put_rows, select_rows
 from baselines.compensation.observation_view import ObservationView
-from baselines.estimation.bending import BendingObserver
 from baselines.estimation.ground_level import GroundLevel, GroundMemory
+from baselines.estimation.model_error import BendingObserver
 from baselines.residual.correction import Corrected
 from baselines.residual.mirror import LeftFirst
 from baselines.residual.true_robot import true_robot

@@ -121,15 +121,6 @@ def beats(mine: Any, base: Any) -> Any:
     return (mine < base) + 0.5 * (mine == base)
 
 
-def over_seeds(values: Sequence[float] | Array) -> Estimate:
-    """Interquartile mean over training seeds with its 95 % percentile bootstrap interval.
-
-    Args:
-        values: One per training seed; nan for a seed without a value, which is left out.
-    """
-    return estimate(lambda _: np.asarray(values, dtype=np.float64)[None], ())
-
-
 def improvement(won: Sequence[Array], played: Sequence[Array]) -> Estimate:
     """Probability that an episode is better (lower) than the same with the base; ties count half.
 

@@ -14,7 +14,7 @@ import numpy as np
 from baselines.adaptation.estimators import ASSUMED_LOADS
 from baselines.compensation.compensated import Compensated
 from baselines.compensation.contact_torque import ContactGravity
-from baselines.estimation.bending import DISAGREEMENT_RAD, LOADED_SHARE, MODEL_ERROR, OFFSET_RAD
+from baselines.estimation.model_error import DISAGREEMENT_RAD, LOADED_SHARE, MODEL_ERROR, OFFSET_RAD
 from elastic_env.core.signals import Array
 from elastic_env.world.robot_model import WalkerModel
 from train.export.c_text import (

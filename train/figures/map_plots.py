@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from train.evaluate.change_text import BEST_ANALYTIC, SIGNS, percent
 from train.evaluate.environments import Column
 from train.evaluate.maps import HeatMap, MapCell
-from train.evaluate.terms import BEST_ANALYTIC, SIGNS, percent
 from train.figures.colours import INK, policy_colours
 from train.figures.plots import new_figure, save
 
