@@ -9,7 +9,7 @@ import pytest
 
 from baselines.identification.geometry_fit import QUANTILE, fit_geometry
 from baselines.identification.geometry_gradient import marker_gradient
-from baselines.identification.geometry_model import AxialTorques, GeometryModel, GeometryParameters
+from baselines.identification.geometry_model import ArmParameters, AxialTorques, GeometryModel
 from baselines.identification.geometry_problem import GeometryProblem
 from baselines.identification.geometry_result import correct_model, describe_geometry
 from baselines.identification.holdout import (
@@ -71,9 +71,9 @@ def draw(seed: int, count: int = 6) -> tuple[np.random.Generator, Array]:
     return generator, generator.uniform(-1.2, 1.2, (count, len(JOINTS)))
 
 
-def some_parameters(generator: np.random.Generator) -> GeometryParameters:
+def some_parameters(generator: np.random.Generator) -> ArmParameters:
     """Parameters far from nominal ones, with deflections of a tenth of a radian."""
-    return GeometryParameters(
+    return ArmParameters(
         translation=0.1 * generator.standard_normal(3),
         rotation=0.3 * generator.standard_normal(3),
         marker=0.05 * generator.standard_normal((2, 3)),

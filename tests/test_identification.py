@@ -11,8 +11,7 @@ import pytest
 
 import baselines.identification.identify as identification
 from baselines.compensation.gravity_torque import GravityModel, make_gravity
-from baselines.identification.identify import Identification, identify, identify_points
-from baselines.identification.point_regression import fit_points
+from baselines.identification.identify import Identification, fit_points, identify, identify_points
 from baselines.identification.static_points import HoldRecorder, StaticPoints, record_points
 from elastic_env.core.errors import ConfigurationError, ElasticError
 from elastic_env.core.signals import Array

@@ -29,7 +29,7 @@ from baselines.identification.pose_checks import (
 )
 from baselines.identification.pose_log import MEASUREMENT_UNITS, Kind
 from baselines.identification.pose_model import PoseModel
-from baselines.identification.prior_least_squares import information_with_prior, solve_with_prior
+from baselines.identification.prior_least_squares import solve_with_prior
 from elastic_env.core.errors import ElasticError
 from elastic_env.core.signals import Array, IntArray
 
@@ -93,7 +93,8 @@ class ArmFit:
     def estimate(self, name: str) -> tuple[Array, Array]:
         """Estimates of one kind of unknown and the half-widths of their 95 % intervals."""
         part = self.model.unknowns.slices[name]
-        return self.unknowns[part], self.quantile * np.sqrt(np.diag(self.covariance)[part])
+        deviation = np.sqrt(np.diag(self.covariance)[part])
+        return self.unknowns[part], self.quantile * deviation
 
     @property
     def outliers(self) -> IntArray:
@@ -182,7 +183,7 @@ def _linearised_spread(model: PoseModel) -> float:
     noise = _LEAST_NOISE[model.log.kind]
     rows = gradient.reshape(-1, len(start)) * model.scale / noise
     residual = (model.target - predicted).ravel() / noise
-    step = np.linalg.solve(information_with_prior(rows), rows.T @ residual)
+    step = np.linalg.solve(rows.T @ rows + np.eye(len(start)), rows.T @ residual)
     return noise * float(np.std(residual - rows @ step))
 
 

@@ -11,11 +11,7 @@ from baselines.identification.arm_fit import ArmFit, deviations
 from baselines.identification.holdout import HeldOut
 from baselines.identification.pose_log import Kind
 from baselines.identification.pose_model import SMALLEST_LOAD
-from baselines.identification.result_files import (
-    save_result,
-    stiffness_interval,
-    stiffness_line,
-)
+from baselines.identification.results import save_result, stiffness_ends, stiffness_line
 from elastic_env.core.config import Model
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array, BoolArray
@@ -30,11 +26,11 @@ rigid. Rigid where the poses do not determine the joint, or where the estimate o
 Assumed where the user gave K instead.
 """
 
-_LARGEST_OFFSET_HALF_WIDTH_RAD = 0.05
+_WIDEST_OFFSET_RAD = 0.05
 """Half-width of an offset's interval above which the poses do not determine the offset."""
 _LARGEST_HALF_WIDTH = 0.5
 """The same for friction and payload, as a share of their plausible size."""
-_LEAST_SENSITIVITY = 0.05
+_LEAST_EFFECT = 0.05
 """Share of the largest derivative by a joint's angle below which a joint is not measured.
 
 Gravity couples the other joints by less.
@@ -104,7 +100,8 @@ class ArmIdentification(Model):
             stiffness_line(joint.joint, joint.stiffness_nm_per_rad, _comment(joint))
             for joint in self.joints
         ]
-        lines += [stiffness_line(name, math.inf, "rigid: not sought") for name in self.rigid_joints]
+        rigid = "rigid: not sought"
+        lines += [stiffness_line(name, math.inf, rigid) for name in self.rigid_joints]
         lines += [yaml_line(name, "held", "not in the log") for name in self.held_joints]
         return save_result(self, folder, head, lines)
 
@@ -174,8 +171,8 @@ def wide_interval_reasons(fit: ArmFit, within: float) -> list[str]:
     model = fit.model
     unloaded = model.load < SMALLEST_LOAD * np.abs(model.arm.torque(fit.q)).max()
     _, gradient = model.predict(fit.unknowns)
-    sensitivity = np.abs(gradient[..., model.unknowns.slices["offset"]]).max(axis=(0, 1))
-    unseen = sensitivity < _LEAST_SENSITIVITY * sensitivity.max()
+    effect = np.abs(gradient[..., model.unknowns.slices["offset"]]).max(axis=(0, 1))
+    unseen = effect < _LEAST_EFFECT * effect.max()
     correlated = _correlated_compliances(fit)
     names = [model.log.joints[joint] for joint in model.unknowns.elastic]
 
@@ -201,8 +198,10 @@ def _correlated_compliances(fit: ArmFit) -> BoolArray:
     """Pairs of compliances that the poses hardly separate, (k, k)."""
     part = fit.model.unknowns.slices["compliance"]
     covariance = np.linalg.inv(fit.information)[part, part]
-    correlation = covariance / np.sqrt(np.outer(np.diag(covariance), np.diag(covariance)))
-    return (np.abs(correlation) > _LARGEST_CORRELATION) & ~np.eye(len(covariance), dtype=bool)
+    variance = np.diag(covariance)
+    correlation = covariance / np.sqrt(np.outer(variance, variance))
+    is_diagonal = np.eye(len(covariance), dtype=bool)
+    return (np.abs(correlation) > _LARGEST_CORRELATION) & ~is_diagonal
 
 
 def _joint_stiffness(
@@ -227,7 +226,7 @@ def _joint_stiffness(
     stiffness = math.inf
     if source != "rigid":
         stiffness = 1.0 / best if assumed is None or c > h else assumed
-    low, high = stiffness_interval(c, h)
+    low, high = stiffness_ends(c, h)
     return JointStiffness(
         joint=fit.model.log.joints[fit.model.unknowns.elastic[i]],
         stiffness_nm_per_rad=stiffness,
@@ -239,7 +238,7 @@ def _joint_stiffness(
         is_negative=is_observable and best == 0.0,
         friction_nm=friction,
         friction_half_width_nm=friction_half,
-        offset_rad=float(offset[i]) if offset_half[i] < _LARGEST_OFFSET_HALF_WIDTH_RAD else None,
+        offset_rad=float(offset[i]) if offset_half[i] < _WIDEST_OFFSET_RAD else None,
         offset_half_width_rad=float(offset_half[i]),
         largest_torque_nm=float(fit.model.load[i]),
         planned_half_width=None if expected is None else float(expected[i]),
@@ -255,12 +254,12 @@ def bounded_compliance(fit: ArmFit) -> Array:
     part = fit.model.unknowns.slices["compliance"]
     scale = fit.model.scale[part]
     covariance = np.linalg.inv(fit.information)[part, part]
-    best = compliance / scale
+    best = scaled = compliance / scale
     zero = np.zeros(len(best), dtype=np.bool_)
     while (best < 0.0).any():
         zero |= best < 0.0
-        multiplier = np.linalg.solve(covariance[np.ix_(zero, zero)], compliance[zero] / scale[zero])
-        best = compliance / scale - covariance[:, zero] @ multiplier
+        multiplier = np.linalg.solve(covariance[np.ix_(zero, zero)], scaled[zero])
+        best = scaled - covariance[:, zero] @ multiplier
         best[zero] = 0.0
     return compliance if not zero.any() else best * scale
 

@@ -15,9 +15,9 @@ from functools import cached_property
 
 import numpy as np
 
-from baselines.identification.geometry_model import GeometryParameters
+from baselines.identification.geometry_model import ArmParameters
 from baselines.identification.geometry_problem import GeometryProblem
-from baselines.identification.prior_least_squares import information_with_prior, solve_with_prior
+from baselines.identification.prior_least_squares import solve_with_prior
 from elastic_env.core.config import Model
 from elastic_env.core.errors import ConfigurationError, ElasticError
 from elastic_env.core.signals import Array
@@ -31,7 +31,7 @@ _FIRST_NOISE_M = 3e-3
 _NOISE_ROUNDS = 3
 """Fits, each with the noise of the residuals of the one before."""
 _LEAST_NOISE_M = 1e-5
-_LARGEST_DEVIATION_RATIO = 0.5
+_LARGEST_RATIO = 0.5
 """Posterior over prior deviation from which on the poses do not determine a parameter."""
 _FEWEST_POSES = 2
 QUANTILE = 1.96
@@ -55,7 +55,7 @@ class GeometryEstimate(Model):
     """One parameter and its 95 % interval."""
 
     kind: str
-    """Field of `GeometryParameters`: translation and rotation of the tracker, marker, offset,
+    """Field of `ArmParameters`: translation and rotation of the tracker, marker, offset,
     length, angle, compliance, friction.
     """
     name: str
@@ -85,7 +85,7 @@ class GeometryFit:
     noise_m: float
 
     @property
-    def parameters(self) -> GeometryParameters:
+    def parameters(self) -> ArmParameters:
         """All parameters."""
         return self.problem.parameters(self.x)
 
@@ -101,17 +101,15 @@ class GeometryFit:
                 value=self.x[i],
                 half_width=QUANTILE * deviation[i],
                 unit=_UNITS[unknowns.kinds[i]],
-                is_told=bool(deviation[i] < _LARGEST_DEVIATION_RATIO * unknowns.prior[i]),
+                is_told=bool(deviation[i] < _LARGEST_RATIO * unknowns.prior[i]),
             )
             for i in range(len(self.x))
         )
 
     def prediction_error(self, problem: GeometryProblem) -> Array:
         """Measured less predicted places of the markers, (N, k, 3) [m]."""
-        model = self.problem.model
-        return problem.measured - model.predict_markers(
-            self.parameters, problem.theta, problem.axial
-        )
+        predict = self.problem.model.predict_markers
+        return problem.measured - predict(self.parameters, problem.theta, problem.axial)
 
 
 def fit_geometry(problem: GeometryProblem) -> GeometryFit:
@@ -144,7 +142,8 @@ def fit_geometry(problem: GeometryProblem) -> GeometryFit:
 def _covariance(problem: GeometryProblem, x: Array, noise: float) -> Array:
     """Covariance of the unknowns in units of their priors, (p, p)."""
     _, gradient = problem.linearise(x)
-    return np.linalg.inv(information_with_prior(gradient * problem.unknowns.prior / noise))
+    rows = gradient * problem.unknowns.prior / noise
+    return np.linalg.inv(rows.T @ rows + np.eye(len(x)))
 
 
 def _solve(problem: GeometryProblem, x: Array, noise: float) -> Array:

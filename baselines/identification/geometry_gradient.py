@@ -15,9 +15,9 @@ from typing import NamedTuple
 import numpy as np
 
 from baselines.identification.geometry_model import (
+    ArmParameters,
     AxialTorques,
     GeometryModel,
-    GeometryParameters,
     Posture,
 )
 from baselines.identification.rotations import cross_matrix, left_jacobian
@@ -26,10 +26,10 @@ from elastic_env.core.signals import Array, BoolArray, IntArray
 
 def marker_gradient(
     model: GeometryModel,
-    parameters: GeometryParameters,
+    parameters: ArmParameters,
     theta: Array,
     axial: AxialTorques | None = None,
-) -> tuple[Array, GeometryParameters]:
+) -> tuple[Array, ArmParameters]:
     """Places of the markers, and their derivatives; arguments as `GeometryModel.posture`.
 
     Returns:
@@ -47,12 +47,13 @@ def marker_gradient(
     count, k, _ = places.shape
     n = model.num_joints
     is_own = np.eye(3 * n, dtype=np.bool_)
-    by_compliance = motion.turn_gradient(np.where(is_own, loads.reshape(count, 1, 3 * n), 0.0))
+    diagonal = np.where(is_own, loads.reshape(count, 1, 3 * n), 0.0)
+    by_compliance = motion.turn_gradient(diagonal)
     by_friction = np.zeros((count, k, 3, n))
     if axial is not None:
         turns = (-parameters.compliance[:, 2] * axial.direction)[:, None]
         by_friction = motion.turn_gradient(np.where(is_own[:, 2::3], turns, 0.0))
-    return places, GeometryParameters(
+    return places, ArmParameters(
         translation=np.broadcast_to(np.eye(3), (count, k, 3, 3)),
         rotation=-cross_matrix(places - model.origin - parameters.translation)
         @ left_jacobian(parameters.rotation),
@@ -93,7 +94,7 @@ class _SmallMotion:
     """
 
     model: GeometryModel
-    parameters: GeometryParameters
+    parameters: ArmParameters
     posture: Posture
     loads: Array
 
@@ -109,7 +110,8 @@ class _SmallMotion:
 
     def twist_gradient(self, twists: _Twists) -> Array:
         """Derivatives by twists, (N, k, 3, P)."""
-        return self.turn_gradient(self._moment_changes(twists), self._marker_velocities(twists))
+        turns = self._moment_changes(twists)
+        return self.turn_gradient(turns, self._marker_velocities(twists))
 
     def turn_gradient(self, turns: Array, direct: Array | float = 0.0) -> Array:
         """Derivatives of the places in the tracker's frame, (N, k, 3, P).
@@ -157,12 +159,13 @@ class _SmallMotion:
         by_carried = by_carried + carried_weight * twists.velocity
         for j in range(n):
             # the twist moves joint j itself, or weight beyond it
-            carries_joint = is_beyond[twists.joint, j][:, None]
+            carries = is_beyond[twists.joint, j][:, None]
             is_beyond_joint = is_beyond[j, twists.joint][:, None]
             by_joint = np.cross(twists.axis, lever[:, j, None])
-            change = np.where(carries_joint, by_joint, np.where(is_beyond_joint, by_carried, 0.0))
+            beyond = np.where(is_beyond_joint, by_carried, 0.0)
+            change = np.where(carries, by_joint, beyond)
             moment = np.cross(change, self.model.down)
-            turns = carries_joint & ((twists.joint != j) | twists.turns_housing)[:, None]
+            turns = carries & ((twists.joint != j) | twists.turns_housing)[:, None]
             joint_moment = np.cross(self.posture.lever[j], self.model.down)[:, None]
             moment = moment - np.where(turns, np.cross(twists.axis, joint_moment), 0.0)
             changes[j] = moment @ self.posture.housing[j]

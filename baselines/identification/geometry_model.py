@@ -61,7 +61,7 @@ class Marker:
     place: Array
 
 
-class GeometryParameters(NamedTuple):
+class ArmParameters(NamedTuple):
     """Values of all parameters, by kind.
 
     Attributes:
@@ -218,10 +218,10 @@ class GeometryModel:
             normals[j, 1] = np.cross([0.0, 0.0, 1.0], normals[j, 0])
         return normals
 
-    def nominal_parameters(self) -> GeometryParameters:
+    def nominal_parameters(self) -> ArmParameters:
         """Parameters of the rigid nominal model."""
         n = self.num_joints
-        return GeometryParameters(
+        return ArmParameters(
             translation=np.zeros(3),
             rotation=np.zeros(3),
             marker=np.zeros((len(self.markers), 3)),
@@ -233,17 +233,18 @@ class GeometryModel:
         )
 
     def predict_markers(
-        self, parameters: GeometryParameters, theta: Array, axial: AxialTorques | None = None
+        self, parameters: ArmParameters, theta: Array, axial: AxialTorques | None = None
     ) -> Array:
         """Places of the markers in the tracker's frame, (N, k, 3) [m], at motor encoders (N, n).
 
         Raises:
             ElasticError: The load overcomes a joint.
         """
-        return self.to_tracker(parameters, self.posture(parameters, theta, axial).marker)
+        posture = self.posture(parameters, theta, axial)
+        return self.to_tracker(parameters, posture.marker)
 
     def posture(
-        self, parameters: GeometryParameters, theta: Array, axial: AxialTorques | None = None
+        self, parameters: ArmParameters, theta: Array, axial: AxialTorques | None = None
     ) -> Posture:
         """The joints at rest, by iteration: deflections follow from the moments at the last ones.
 
@@ -276,24 +277,25 @@ class GeometryModel:
         )
 
     def loads(
-        self, parameters: GeometryParameters, posture: Posture, axial: AxialTorques | None
+        self, parameters: ArmParameters, posture: Posture, axial: AxialTorques | None
     ) -> Array:
         """Moments that bend the joints, in the axes of the housings, (N, n, 3) [N·m]."""
         moments = self.moments(posture)
         if axial is not None:
-            moments[..., 2] += axial.known_torque - parameters.friction * axial.direction
+            friction = parameters.friction * axial.direction
+            moments[..., 2] += axial.known_torque - friction
         return moments
 
-    def tracker_rotation(self, parameters: GeometryParameters) -> Array:
+    def tracker_rotation(self, parameters: ArmParameters) -> Array:
         """Rotation from the base to the tracker, (3, 3)."""
         return rotation_of(parameters.rotation) @ self.alignment
 
-    def to_tracker(self, parameters: GeometryParameters, places: Array) -> Array:
+    def to_tracker(self, parameters: ArmParameters, places: Array) -> Array:
         """Places in the tracker's frame, from the base, (..., 3) [m]."""
         R = self.tracker_rotation(parameters)
         return places @ R.T + self.origin + parameters.translation
 
-    def _place(self, parameters: GeometryParameters, angles: Array, turn: Array) -> Posture:
+    def _place(self, parameters: ArmParameters, angles: Array, turn: Array) -> Posture:
         """Frames at given angles of the joints, and deflections in the axes of the housings."""
         count, n = angles.shape
         housing = np.empty((n, count, 3, 3))
@@ -309,12 +311,12 @@ class GeometryModel:
             housing[j] = R @ (self.nominal[j] @ errors[j])
             link[j] = housing[j] @ deflections[:, j] @ rotation_about_z(angles[:, j])
             lever[j] = link[j] @ self.weight_moment[j]
-        carried_weight = self.weight.copy()
+        load = self.weight.copy()
         for j in range(n - 1, -1, -1):
             parent = self.parent[j]
             if parent >= 0:
-                lever[parent] += lever[j] + carried_weight[j] * (anchor[j] - anchor[parent])
-                carried_weight[parent] += carried_weight[j]
+                lever[parent] += lever[j] + load[j] * (anchor[j] - anchor[parent])
+                load[parent] += load[j]
         places = [
             np.broadcast_to(marker.place + shift, (count, 3))
             if marker.joint < 0

@@ -8,16 +8,16 @@ from scipy.spatial.transform import Rotation
 
 from baselines.identification.geometry_gradient import marker_gradient
 from baselines.identification.geometry_model import (
+    ArmParameters,
     AxialTorques,
     Geometry,
     GeometryModel,
-    GeometryParameters,
 )
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array, IntArray
 
-_MARKER_SPREAD_RATIO = 3.0
+_SPREAD_RATIO = 3.0
 """Ratio between measured spread of markers and the model's from which the units differ."""
 _EXACT_RAD = 1e-9
 """Deviation of a prior that leaves a parameter at its nominal value [rad]."""
@@ -53,7 +53,7 @@ class GeometryUnknowns:
     """Unknown parameters as one vector x.
 
     Attributes:
-        kinds: Field of `GeometryParameters` of each unknown, (p,).
+        kinds: Field of `ArmParameters` of each unknown, (p,).
         names: Joint or marker and axis of each unknown, such as `elbow.x`, (p,).
         basis: Derivatives of all parameters, flat, by x, (f, p).
         prior: Standard deviations of the priors, (p,).
@@ -114,16 +114,17 @@ class GeometryProblem:
         expected_m, measured_m = (
             float(np.std(part, axis=0).max()) for part in (expected, measured)
         )
-        if not expected_m / _MARKER_SPREAD_RATIO < measured_m < expected_m * _MARKER_SPREAD_RATIO:
+        if not expected_m / _SPREAD_RATIO < measured_m < expected_m * _SPREAD_RATIO:
             raise ConfigurationError(
                 f"the markers spread over {measured_m:.3g} m, those of the model over"
                 f" {expected_m:.3g} m: convert millimetres to metres, or name the bodies that were"
                 " measured"
             )
-        middle = measured.mean(axis=0)
-        expected_middle = expected.mean(axis=0)
-        R = Rotation.align_vectors(measured - middle, expected - expected_middle)[0].as_matrix()
-        aligned = replace(self.model, alignment=R, origin=middle - R @ expected_middle)
+        centre = measured.mean(axis=0)
+        model_centre = expected.mean(axis=0)
+        rotation = Rotation.align_vectors(measured - centre, expected - model_centre)[0]
+        R = rotation.as_matrix()
+        aligned = replace(self.model, alignment=R, origin=centre - R @ model_centre)
         other = replace(self, model=aligned)
         other.__dict__["unknowns"] = self.unknowns
         return other
@@ -149,13 +150,13 @@ class GeometryProblem:
         priors = self.priors
         nominal = self.model.nominal_parameters()
         edges = np.cumsum([0, *(part.size for part in nominal)])
-        starts = dict(zip(GeometryParameters._fields, edges, strict=False))
+        starts = dict(zip(ArmParameters._fields, edges, strict=False))
         rows: list[tuple[str, str, Array, float]] = []
 
-        def add(kind: str, name: str, first: int, direction: Array, prior: float) -> None:
+        def add(kind: str, name: str, first: int, values: Array, prior: float) -> None:
             column = np.zeros(edges[-1])
             start = starts[kind] + first
-            column[start : start + len(direction)] = direction
+            column[start : start + len(values)] = values
             rows.append((kind, name, column, prior))
 
         for axis, unit in zip("xyz", np.eye(3), strict=True):
@@ -166,11 +167,12 @@ class GeometryProblem:
         for j, joint in enumerate(self.model.joints):
             is_free = joint in self.free
             scalar = np.ones(1)
-            add("offset", joint, j, scalar, priors.frame_rad if is_free else priors.offset_rad)
             size = {
+                "offset": priors.frame_rad if is_free else priors.offset_rad,
                 "length": priors.frame_m if is_free else priors.length_m,
                 "angle": priors.frame_rad if is_free else priors.angle_rad,
             }
+            add("offset", joint, j, scalar, size["offset"])
             for kind, name, direction in self._frame_errors(j, is_free):
                 add(kind, f"{joint}.{name}", 3 * j, direction, size[kind])
             if joint not in self.elastic:
@@ -184,7 +186,8 @@ class GeometryProblem:
             if self.axial is not None and self.axial.direction[:, j].any():
                 add("friction", joint, j, scalar, priors.friction_share * moment[2])
         kinds, names, columns, deviations = zip(*rows, strict=True)
-        return GeometryUnknowns(kinds, names, np.stack(columns, axis=1), np.array(deviations))
+        basis = np.stack(columns, axis=1)
+        return GeometryUnknowns(kinds, names, basis, np.array(deviations))
 
     def _frame_errors(self, joint: int, is_free: bool) -> list[tuple[str, str, Array]]:
         """Kind, name and direction of the unknown lengths and angles of a joint's frame."""
@@ -197,25 +200,23 @@ class GeometryProblem:
             errors += [("length", "y", along), ("angle", "y", along)]
         return errors
 
-    def parameters(self, x: Array) -> GeometryParameters:
+    def parameters(self, x: Array) -> ArmParameters:
         """All parameters at x."""
-        flat = self.unknowns.basis @ x
         nominal = self.model.nominal_parameters()
         ends = np.cumsum([part.size for part in nominal])
-        parts = np.split(flat, ends[:-1])
+        parts = np.split(self.unknowns.basis @ x, ends[:-1])
         pairs = zip(parts, nominal, strict=True)
-        return GeometryParameters(*(part.reshape(like.shape) for part, like in pairs))
+        return ArmParameters(*(part.reshape(like.shape) for part, like in pairs))
 
     def residual(self, x: Array) -> Array:
         """Predicted less measured, (N k 3,) [m]."""
-        predicted = self.model.predict_markers(self.parameters(x), self.theta, self.axial)
-        return (predicted - self.measured).ravel()
+        places = self.model.predict_markers(self.parameters(x), self.theta, self.axial)
+        return (places - self.measured).ravel()
 
     def linearise(self, x: Array) -> tuple[Array, Array]:
         """The residual, (N k 3,) [m], and its derivatives by x, (N k 3, p)."""
-        predicted, gradient = marker_gradient(
-            self.model, self.parameters(x), self.theta, self.axial
-        )
-        rows = predicted.size
+        parameters = self.parameters(x)
+        places, gradient = marker_gradient(self.model, parameters, self.theta, self.axial)
+        rows = places.size
         flat = np.concatenate([part.reshape(rows, -1) for part in gradient], axis=1)
-        return (predicted - self.measured).ravel(), flat @ self.unknowns.basis
+        return (places - self.measured).ravel(), flat @ self.unknowns.basis

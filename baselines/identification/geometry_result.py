@@ -9,11 +9,7 @@ from pydantic import Field
 from baselines.identification.geometry_fit import GeometryEstimate, GeometryFit
 from baselines.identification.geometry_model import Geometry
 from baselines.identification.holdout import HeldOut
-from baselines.identification.result_files import (
-    save_result,
-    stiffness_interval,
-    stiffness_line,
-)
+from baselines.identification.results import save_result, stiffness_ends, stiffness_line
 from baselines.identification.rotations import rotation_of
 from elastic_env.core.config import Model
 from elastic_env.core.errors import ConfigurationError
@@ -70,16 +66,15 @@ class GeometryIdentification(Model):
 def describe_geometry(fit: GeometryFit, held_out: HeldOut | None) -> GeometryIdentification:
     """Result of a fit."""
     problem = fit.problem
-    compliances = {one.name: one for one in fit.estimates if one.kind == "compliance"}
+    compliances = {e.name: e for e in fit.estimates if e.kind == "compliance"}
+    joints = [_compliance_of(name, compliances.get(name)) for name in problem.model.joints]
     return GeometryIdentification(
         poses=len(problem.theta),
         numbers=problem.measured.size,
         geometry=problem.geometry,
         lateral=problem.lateral,
         noise_mm=1e3 * fit.noise_m,
-        joints=tuple(
-            _joint_compliance(joint, compliances.get(joint)) for joint in problem.model.joints
-        ),
+        joints=tuple(joints),
         parameters=fit.estimates,
         held_out=held_out,
     )
@@ -121,7 +116,7 @@ def correct_model(spec: mujoco.MjSpec, tree: Tree, fit: GeometryFit) -> mujoco.M
         anchor = R.T @ (problem.model.anchor[j] - tree.place[above])
         shift = R.T @ problem.model.nominal[j] @ fit.parameters.length[j]
         target = bodies[body]
-        if target.frame is not None:  # the pose is in the parent, not in the frame of the file
+        if target.frame is not None:  # the new pose is in the parent's axes
             target.set_frame(target.parent.add_frame())
         target.pos = anchor + shift + turn @ (model.body_pos[body] - anchor)
         target.quat = quaternion_of(turn @ matrix_of(model.body_quat[body]))
@@ -129,13 +124,13 @@ def correct_model(spec: mujoco.MjSpec, tree: Tree, fit: GeometryFit) -> mujoco.M
     return corrected
 
 
-def _joint_compliance(joint: str, estimate: GeometryEstimate | None) -> JointCompliance:
+def _compliance_of(joint: str, estimate: GeometryEstimate | None) -> JointCompliance:
     """Result of a joint; rigid where its compliance is not determined or not above zero."""
     c = h = 0.0
     if estimate is not None and estimate.value > 0.0 and estimate.is_told:
         c = estimate.value
         h = estimate.half_width
-    low, high = stiffness_interval(c, h)
+    low, high = stiffness_ends(c, h)
     return JointCompliance(
         joint=joint,
         stiffness_nm_per_rad=1.0 / c if c else math.inf,

@@ -23,6 +23,8 @@ FEWEST_POSES = 10
 """Poses on either side of a split, at least."""
 PredictionError = Callable[[IntArray], Array]
 """Measured less predicted at given poses: vectors of k places, (N, k, d), in SI units."""
+Folds = list[IntArray]
+"""Poses that each fold holds out."""
 ErrorUnit = Literal["mm", "mrad", "N·m"]
 
 
@@ -95,7 +97,7 @@ class HoldoutProblem:
 
     @classmethod
     def from_geometry(cls, problem: GeometryProblem) -> "HoldoutProblem":
-        """Markers of an arm whose geometry is unknown too."""
+        """Problem of an arm with markers whose geometry is unknown too."""
 
         def fit(inner: GeometryProblem) -> PredictionError:
             result = fit_geometry(inner)
@@ -112,12 +114,13 @@ class HoldoutProblem:
 
     @classmethod
     def from_poses(cls, model: PoseModel) -> "HoldoutProblem":
-        """Measurement of an arm whose stiffness is unknown."""
+        """Problem of a measurement of an arm whose stiffness is unknown."""
         rigid = replace(model, unknowns=model.unknowns.frame_alone())
+        part = model.log.part
 
         def fit(inner: PoseModel) -> PredictionError:
             unknowns = solve_unknowns(inner)
-            return lambda poses: inner.with_log(model.log.part(poses)).prediction_error(unknowns)
+            return lambda poses: inner.with_log(part(poses)).prediction_error(unknowns)
 
         of, unit = _MEASUREMENTS[model.log.kind]
         return cls(
@@ -125,11 +128,11 @@ class HoldoutProblem:
             of=of,
             unit=unit,
             fewest=max(needed_poses(model), FEWEST_POSES),
-            fit_rigid=lambda poses: fit(replace(rigid, log=model.log.part(poses))),
-            fit_elastic=lambda poses: fit(replace(model, log=model.log.part(poses))),
+            fit_rigid=lambda poses: fit(replace(rigid, log=part(poses))),
+            fit_elastic=lambda poses: fit(replace(model, log=part(poses))),
         )
 
-    def shortage(self, parts: list[IntArray]) -> str:
+    def shortage(self, parts: Folds) -> str:
         """Message that a split leaves too few poses, with a cure; empty where it leaves enough."""
         count = len(self.theta)
         fitted = min(count - len(part) for part in parts)
@@ -141,7 +144,7 @@ class HoldoutProblem:
             f" {FEWEST_POSES} are needed; log more poses, or choose --holdout or --folds"
         )
 
-    def curve_counts(self, parts: list[IntArray]) -> list[int]:
+    def curve_counts(self, parts: Folds) -> list[int]:
         """Numbers of poses of the curve in ascending order: halved down to the fewest."""
         counts = []
         count = len(self.theta) - len(parts[0])
@@ -161,7 +164,7 @@ _MEASUREMENTS: dict[Kind, tuple[str, ErrorUnit]] = {
 """Names of the measurements, and the units of their errors."""
 
 
-def split(count: int, share: float, folds: int, seed: int) -> list[IntArray]:
+def split(count: int, share: float, folds: int, seed: int) -> Folds:
     """Poses to hold out, fold by fold; a single fold holds out a share.
 
     Args:
@@ -177,7 +180,7 @@ def split(count: int, share: float, folds: int, seed: int) -> list[IntArray]:
 
 
 def judge(
-    problem: HoldoutProblem, parts: list[IntArray], seed: int, progress: Callable[[int], None]
+    problem: HoldoutProblem, parts: Folds, seed: int, progress: Callable[[int], None]
 ) -> HeldOut:
     """Fit without the poses of each part, and predict them.
 
@@ -190,7 +193,8 @@ def judge(
     Raises:
         ElasticError: A fit does not converge.
     """
-    all_poses = np.arange(len(problem.theta))
+    theta = problem.theta
+    all_poses = np.arange(len(theta))
     distances: dict[str, list[Array]] = {}
     done = 0
     for part in parts:
@@ -198,9 +202,7 @@ def judge(
         rigid_error = problem.fit_rigid(rest)
         fold = {
             RIGID: _distances(rigid_error(part)),
-            **rival_errors(
-                problem.theta[rest], rigid_error(rest), problem.theta[part], rigid_error(part)
-            ),
+            **rival_errors(theta[rest], rigid_error(rest), theta[part], rigid_error(part)),
             FITTED: _distances(problem.fit_elastic(rest)(part)),
         }
         for name, values in fold.items():
@@ -224,7 +226,7 @@ def judge(
         unit=problem.unit,
         poses=len(rest),
         held_out=sum(len(part) for part in parts),
-        errors=tuple(_summary(name, values, problem.unit) for name, values in distances.items()),
+        errors=tuple(_summary(*item, problem.unit) for item in distances.items()),
         curve=tuple(curve),
     )
 
@@ -243,13 +245,14 @@ def rival_errors(
         other_errors: Measured less predicted by the rigid fit at the others, (M, k, d).
     """
     flat = errors.reshape(len(errors), -1)
+    shape = other_errors.shape
     return {
-        name: _distances(other_errors - predict(angles, flat, others).reshape(other_errors.shape))
+        name: _distances(other_errors - predict(angles, flat, others).reshape(shape))
         for name, predict in RIVALS.items()
     }
 
 
-def num_fits(problem: HoldoutProblem, parts: list[IntArray]) -> int:
+def num_fits(problem: HoldoutProblem, parts: Folds) -> int:
     """Number of fits of `judge`."""
     return len(parts) + len(problem.curve_counts(parts))
 

@@ -16,7 +16,7 @@ from elastic_env.core.signals import Array, BoolArray
 
 _SPARE_POSES = 3
 """Poses needed beyond those that give as many numbers as there are unknowns."""
-_POSITION_SPREAD_RATIO = 3.0
+_SPREAD_RATIO = 3.0
 """Ratio between measured spread of positions and the model's from which the units differ."""
 _OPPOSITE_CORRELATION = -0.9
 """Correlation of two encoders of a joint below which their signs differ."""
@@ -58,8 +58,8 @@ def require_poses(model: PoseModel) -> None:
         return
     positions = (model.arm.attitude(model.log.theta).position, model.log.measured)
     # root mean square distances from the mean, which do not depend on the frame
-    expected, measured = (float(np.sqrt(np.var(part, axis=0).sum())) for part in positions)
-    if not expected / _POSITION_SPREAD_RATIO < measured < expected * _POSITION_SPREAD_RATIO:
+    expected, measured = (float(np.sqrt(np.var(p, axis=0).sum())) for p in positions)
+    if not expected / _SPREAD_RATIO < measured < expected * _SPREAD_RATIO:
         raise ConfigurationError(
             f"the columns end_effector spread over {measured:.3g} m, {model.arm.end_effector!r} of"
             f" the model over {expected:.3g} m: convert millimetres to metres, or name the body"
@@ -121,12 +121,12 @@ def require_deflections_with_load(model: PoseModel, unknowns: Array, half_width:
         )
 
 
-def require_signs(model: PoseModel, residual_spread: Callable[[PoseModel], float]) -> None:
+def require_signs(model: PoseModel, spread_of: Callable[[PoseModel], float]) -> None:
     """Refuse a log that fits the model far better with the sign of a joint reversed.
 
     Args:
         model: The poses.
-        residual_spread: Spread of the residuals of given poses.
+        spread_of: Spread of the residuals of given poses.
 
     Raises:
         ConfigurationError: There is such a joint.
@@ -134,10 +134,10 @@ def require_signs(model: PoseModel, residual_spread: Callable[[PoseModel], float
     joints = model.log.joints
     if len(joints) > _MOST_JOINTS:
         return
-    reversed_logs = {joint: replace(model, log=reverse_joint(model.log, joint)) for joint in joints}
-    spreads = {joint: residual_spread(other) for joint, other in reversed_logs.items()}
+    logs = {joint: reverse_joint(model.log, joint) for joint in joints}
+    spreads = {joint: spread_of(replace(model, log=logs[joint])) for joint in joints}
     least = min(spreads.values())
-    if least < _WRONG_SIGN_RATIO * residual_spread(model):
+    if least < _WRONG_SIGN_RATIO * spread_of(model):
         wrong = [joint for joint, spread in spreads.items() if spread < 2.0 * least]
         raise ConfigurationError(
             f"the links deflect against their load: a sign is wrong ({_joint_names(wrong)}). With"

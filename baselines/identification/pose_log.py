@@ -82,7 +82,7 @@ class PoseLog:
     def part(self, poses: IntArray) -> "PoseLog":
         """Log of some of the poses."""
         tables = {name: getattr(self, name) for name in _TABLES}
-        parts = {name: table[poses] for name, table in tables.items() if table is not None}
+        parts = {name: rows[poses] for name, rows in tables.items() if rows is not None}
         return replace(self, **parts)
 
 
@@ -155,13 +155,11 @@ def average_poses(log: PoseLog) -> PoseLog:
     Their friction and the errors of the model are equal, so that they are not independent.
     """
     sides = np.zeros_like(log.theta) if log.direction is None else log.direction
+    known = log.known_torque
     starts = [0]
     for row in range(1, len(log)):
         moved = np.abs(log.theta[row] - log.theta[starts[-1]]).max() > _EQUAL_WITHIN_RAD
-        moved |= (
-            log.known_torque is not None
-            and (log.known_torque[row] != log.known_torque[starts[-1]]).any()
-        )
+        moved |= known is not None and (known[row] != known[starts[-1]]).any()
         if moved or (sides[row] != sides[starts[-1]]).any():
             starts.append(row)
     count = np.diff([*starts, len(log)])[:, None]
@@ -170,9 +168,7 @@ def average_poses(log: PoseLog) -> PoseLog:
         theta=np.add.reduceat(log.theta, starts) / count,
         measured=np.add.reduceat(log.measured, starts) / count,
         direction=None if log.direction is None else sides[starts],
-        known_torque=None
-        if log.known_torque is None
-        else np.add.reduceat(log.known_torque, starts) / count,
+        known_torque=None if known is None else np.add.reduceat(known, starts) / count,
     )
 
 
@@ -237,7 +233,8 @@ def _column_name(path: Path, text: str) -> str:
 def _table(columns: Mapping[str, Array], quantity: str, names: Sequence[str]) -> Array:
     """A quantity of joints or axes, zero where there is no column, (N, n)."""
     zero = np.zeros(len(next(iter(columns.values()))))
-    return np.stack([columns.get(f"{quantity}.{name}", zero) for name in names], axis=-1)
+    table = [columns.get(f"{quantity}.{name}", zero) for name in names]
+    return np.stack(table, axis=-1)
 
 
 def _choose_quantity(path: Path, quantities: Sequence[str], kind: Kind | None) -> str:

@@ -78,7 +78,8 @@ class PoseModel:
         scale = np.empty(self.unknowns.size)
         scale[parts["compliance"]] = LARGEST_DEFLECTION_RAD / load
         scale[parts["offset"]] = _OFFSET_SCALE_RAD
-        scale[parts["friction"]] = load[: parts["friction"].stop - parts["friction"].start]
+        friction = parts["friction"]
+        scale[friction] = load[: friction.stop - friction.start]
         scale[parts["payload"]] = _PAYLOAD_SCALE_KG
         scale[parts["translation"]] = _TRANSLATION_SCALE_M
         scale[parts["rotation"]] = _ROTATION_SCALE_RAD
@@ -142,7 +143,8 @@ class PoseModel:
     def _weight(self, q: Array) -> Array:
         """Torques that hold the arm against its weight and known torques, (N, n) [N·m]."""
         torque = self.arm.torque(q)
-        return torque if self.log.known_torque is None else torque - self.log.known_torque
+        known = self.log.known_torque
+        return torque if known is None else torque - known
 
     def link_angles(self, unknowns: Array) -> tuple[Array, Array]:
         """Link angles at rest, (N, n) [rad], and (1 + C ∂τ/∂q)⁻¹ there, (N, n, n).
@@ -173,7 +175,8 @@ class PoseModel:
         if not is_unsolved and not is_soft.any():
             return q, inverse
         followed = is_soft | is_unsolved
-        q = np.where(followed, self._follow_load(unknowns, theta, compliance, followed), q)
+        at_end = self._follow_load(unknowns, theta, compliance, followed)
+        q = np.where(followed, at_end, q)
         bend = compliance[:, None] * self.arm.torque_gradient(q, payload_kg)
         return q, np.where(followed[..., None], np.linalg.inv(identity + bend), inverse)
 
@@ -257,15 +260,17 @@ class PoseModel:
         attitude = self.arm.attitude(q)
         rotated = attitude.position @ R.T
         gradient = R @ attitude.position_gradient @ dq
-        gradient[..., parts["translation"]] = np.eye(3)[:, : 3 * self.unknowns.translation]
+        translation = parts["translation"]
+        gradient[..., translation] = np.eye(3)[:, : 3 * self.unknowns.translation]
         if self.unknowns.rotation:
             gradient[..., parts["rotation"]] = -cross_matrix(rotated)
-        shift = unknowns[parts["translation"]]
+        shift = unknowns[translation]
         return rotated + (shift if len(shift) else 0.0), gradient
 
     def _imu_verticals(self, unknowns: Array, attitude: Attitude) -> Array:
         """Predicted unit verticals in the IMU's frame, (N, 3)."""
-        return self._frame_rotation(unknowns) @ attitude.rotation.transpose(0, 2, 1) @ self.arm.up
+        R = self._frame_rotation(unknowns)
+        return R @ attitude.rotation.transpose(0, 2, 1) @ self.arm.up
 
     def _verticals(self, unknowns: Array, q: Array, dq: Array) -> tuple[Array, Array]:
         """Tilt between predicted and measured verticals about two axes [rad], with derivatives."""

@@ -34,7 +34,7 @@ CANDIDATES = 1000
 MOST_PLANNED = 200
 """Poses of a plan."""
 
-_DRAWS_PER_CANDIDATE = 20
+_MOST_DRAWS = 20 * CANDIDATES
 """Random poses that are tried, at most."""
 _RANGE_SHARE = 0.95
 """Share of the joint ranges that is used: commands that lead the link stay within the range."""
@@ -80,11 +80,12 @@ def plan_poses(
         count: Number of poses to choose.
     """
     at_candidates = replace(model, log=candidates)
-    at_candidates.__dict__["scale"] = model.scale  # both informations have the log's units
+    at_candidates.__dict__["scale"] = model.scale  # both in the log's units
     rows, _ = information_of(at_candidates, unknowns, spread)
     chosen = _choose_poses(rows, information, count, len(model.unknowns.elastic))
     direction = None if candidates.direction is None else candidates.direction[chosen]
-    return PosePlan(candidates.theta[chosen], direction, add_information(information, rows[chosen]))
+    information = add_information(information, rows[chosen])
+    return PosePlan(candidates.theta[chosen], direction, information)
 
 
 def plan_further(fit: ArmFit, candidates: PoseLog, count: int) -> PosePlan:
@@ -127,15 +128,13 @@ def candidate_poses(
         return {(int(min(pair)), int(max(pair))) for pair in bodies}
 
     usual = set.intersection(*map(contacts, log.theta if len(log) else [middle]))
-    draws = (
-        middle + half * generator.uniform(-1.0, 1.0, len(middle))
-        for _ in range(_DRAWS_PER_CANDIDATE * CANDIDATES)
-    )
-    poses = list(islice((theta for theta in draws if contacts(theta) <= usual), CANDIDATES))
+    draws = (middle + half * generator.uniform(-1.0, 1.0, len(middle)) for _ in range(_MOST_DRAWS))
+    free = (theta for theta in draws if contacts(theta) <= usual)
+    poses = list(islice(free, CANDIDATES))
     if len(poses) < CANDIDATES // 10:
         raise ElasticError(
-            f"only {len(poses)} of {_DRAWS_PER_CANDIDATE * CANDIDATES} random poses are free of"
-            " contacts; check joint ranges and shapes of the model, or give a model without shapes"
+            f"only {len(poses)} of {_MOST_DRAWS} random poses are free of contacts;"
+            " check joint ranges and shapes of the model, or give a model without shapes"
         )
     theta = np.array(poses)
     sides = None
@@ -155,7 +154,7 @@ def empty_log(arm: StaticArm, kind: Kind) -> PoseLog:
 def _rigid_measurement(arm: StaticArm, log: PoseLog, theta: Array) -> Array:
     """Measurement of an arm with rigid joints in the model's frame, (N, m).
 
-    Only the directions of an IMU matter.
+    `PoseModel` uses it only for the axes of an IMU and the first frame.
     """
     if log.kind == "end_effector":
         return arm.attitude(theta).position
@@ -164,25 +163,26 @@ def _rigid_measurement(arm: StaticArm, log: PoseLog, theta: Array) -> Array:
     return np.zeros((len(theta), len(log.columns)))
 
 
-def _choose_poses(rows: Array, information: Array, count: int, num_sought: int) -> IntArray:
+def _choose_poses(rows: Array, information: Array, count: int, k: int) -> IntArray:
     """Indices of poses by a greedy choice with exchanges.
 
     Args:
         rows: Scaled derivatives of the candidates, (N, m, p).
         information: Information so far, (p, p).
         count: Number of poses to choose.
-        num_sought: Number of the first unknowns, which the criterion is about.
+        k: Number of compliances, the first unknowns, which the criterion is about.
     """
     chosen: list[int] = []
     for _ in range(min(count, len(rows))):
-        best, _ = _best_pose(rows, add_information(information, rows[chosen]), chosen, num_sought)
+        so_far = add_information(information, rows[chosen])
+        best, _ = _best_pose(rows, so_far, chosen, k)
         chosen.append(best)
     for _ in range(_MOST_EXCHANGE_ROUNDS):
         before = list(chosen)
         for i in range(len(chosen)):
             others = chosen[:i] + chosen[i + 1 :]
             without = add_information(information, rows[others])
-            best, gains = _best_pose(rows, without, others, num_sought)
+            best, gains = _best_pose(rows, without, others, k)
             if gains[best] > gains[chosen[i]] + _LEAST_GAIN:
                 chosen[i] = best
         if chosen == before:
@@ -190,12 +190,10 @@ def _choose_poses(rows: Array, information: Array, count: int, num_sought: int) 
     return np.array(chosen, dtype=np.int64)
 
 
-def _best_pose(
-    rows: Array, information: Array, chosen: list[int], num_sought: int
-) -> tuple[int, Array]:
+def _best_pose(rows: Array, information: Array, chosen: list[int], k: int) -> tuple[int, Array]:
     """The pose that adds most to the criterion, and the gain of each pose, (candidates,)."""
-    nuisance = slice(num_sought, None)
-    gains = _gain(rows, information) - _gain(rows[..., nuisance], information[nuisance, nuisance])
+    nuisance = _gain(rows[..., k:], information[k:, k:])
+    gains = _gain(rows, information) - nuisance
     gains[chosen] = -np.inf
     return int(np.argmax(gains)), gains
 

@@ -28,7 +28,7 @@ def solve_with_prior(
     """Minimise the sum of the module by trust regions.
 
     Args:
-        residual: r at x, (p,) to (N,); infinite where x is impossible.
+        residual: r at x, (p,) to (N,); infinite or large where x is impossible.
         jacobian: Derivatives of r, (p,) to (N, p). The solver asks for the residual there first.
         start: First x, (p,).
         max_evaluations: Limit of the calls of `residual`.
@@ -45,14 +45,9 @@ def solve_with_prior(
     return least_squares(
         lambda x: np.concatenate([residual(x), x]),
         start,
-        jac=extended_jacobian,  # pyright: ignore[reportArgumentType]  a callable is correct here
+        jac=extended_jacobian,  # pyright: ignore[reportArgumentType]
         method="trf",
         ftol=ftol,
         max_nfev=max_evaluations,
         x_scale=x_scale,
     )
-
-
-def information_with_prior(rows: Array) -> Array:
-    """Information JᵀJ + 1 of scaled derivatives, (N, p) to (p, p)."""
-    return rows.T @ rows + np.eye(rows.shape[1])

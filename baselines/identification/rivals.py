@@ -39,11 +39,11 @@ def predict_by_kernel(angles: Array, errors: Array, others: Array) -> Array:
 
     Width and ridge are those of the least error in a cross-validation over these poses.
     """
-    deviation = np.where(angles.std(axis=0) > 0.0, angles.std(axis=0), 1.0)
-    scaled, new = ((part - angles.mean(axis=0)) / deviation for part in (angles, others))
+    spread = np.where(angles.std(axis=0) > 0.0, angles.std(axis=0), 1.0)
+    scaled, new = ((part - angles.mean(axis=0)) / spread for part in (angles, others))
     mean = errors.mean(axis=0)
     squared = _squared_distances(scaled, scaled)
-    width, ridge = _best_width_and_ridge(squared, errors - mean, scaled.shape[1])
+    width, ridge = _best_kernel(squared, errors - mean, scaled.shape[1])
     scale = 2.0 * width**2 * scaled.shape[1]
     matrix = np.exp(-squared / scale) + ridge * np.eye(len(scaled))
     weights = np.linalg.solve(matrix, errors - mean)
@@ -58,7 +58,7 @@ RIVALS: dict[str, Rival] = {
 """Rivals by their names in tables."""
 
 
-def _best_width_and_ridge(squared: Array, errors: Array, num_angles: int) -> tuple[float, float]:
+def _best_kernel(squared: Array, errors: Array, num_angles: int) -> tuple[float, float]:
     """Width and ridge of the least error in a cross-validation.
 
     Args:

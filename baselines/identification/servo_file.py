@@ -120,10 +120,11 @@ def _read_csv(path: Path, joint: str | None) -> Content:
                 " tau_known.JOINT"
             )
         file_unit = text.partition("[")[2].rstrip("] ").replace("Nm", "N·m")
-        if file_unit and file_unit != unit and not (unit == "rad" and file_unit == "deg"):
-            allowed = "[rad] or [deg]" if unit == "rad" else f"[{unit}]"
+        allowed = ("rad", "deg") if unit == "rad" else (unit,)
+        if file_unit and file_unit not in allowed:
+            choices = " or ".join(f"[{choice}]" for choice in allowed)
             raise ConfigurationError(
-                f"{path}, column {name}: the unit must be {allowed}, got"
+                f"{path}, column {name}: the unit must be {choices}, got"
                 f" [{quote(file_unit)[1:-1]}]; convert the column"
             )
         if unit == "rad":
@@ -182,7 +183,7 @@ def _read_json(path: Path, joint: str | None) -> Content:
                 " in all entries or in none"
             )
         columns[name] = np.array(
-            [_entry_value(path, number, key, entry[key]) for number, entry in enumerate(entries, 1)]
+            [_entry_value(path, n, key, e[key]) for n, e in enumerate(entries, 1)]
         )
     return Content(columns, _facts(path, content))
 
@@ -300,7 +301,7 @@ def _parquet_column(path: Path, key: str, cells: list[Any]) -> Array:
     """Numbers of a column, (N, number of joints).
 
     Raises:
-        ConfigurationError: The rows have different lengths, or contain no finite numbers.
+        ConfigurationError: The rows have different lengths, or not all numbers are finite.
     """
     rows = [np.ravel(cell) for cell in cells]
     if len({len(row) for row in rows}) > 1 or not len(rows[0]):

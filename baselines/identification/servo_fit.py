@@ -134,11 +134,12 @@ def _fit_at(
     is_estimated[free] = True
     values = problem.expand(z.copy())
     tied = {}
+    limit = INDEX["torque_limit"]
     if problem.limit_per_gain is not None:
         tied["torque_limit"] = "position_gain and the logged PWM"
-        half[INDEX["torque_limit"]] = half[INDEX["position_gain"]] * problem.limit_per_gain
-    elif not is_estimated[INDEX["torque_limit"]]:
-        values[INDEX["torque_limit"]] = np.inf
+        half[limit] = half[INDEX["position_gain"]] * problem.limit_per_gain
+    elif not is_estimated[limit]:
+        values[limit] = np.inf
     if not problem.split_damping:
         tied["viscous_friction"] = f"{100 * VISCOUS_SHARE:g} % of the damping, assumed"
         half[INDEX["motor_damping"]] *= 1.0 - VISCOUS_SHARE

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from baselines.identification.rivals import predict_linear
 from baselines.identification.servo_fit import ServoFit
 from baselines.identification.servo_log import FEWEST_ROWS, ServoLog, slow_rows
 from elastic_env.core.config import Model
@@ -74,8 +73,8 @@ def judge_servo(fit: ServoFit, held_out: Sequence[ServoLog]) -> ServoHoldout:
     for log in held_out:
         replay = fit.replay(log)
         errors = np.vstack([rivals(fit.logs, log), replay]) - log.position
-        after_slow = np.vstack([rivals(fit.logs, log, slow=True), replay]) - log.position
-        slow.append(after_slow[:, slow_rows(log)])
+        slow_fit = np.vstack([rivals(fit.logs, log, slow=True), replay]) - log.position
+        slow.append(slow_fit[:, slow_rows(log)])
         logs.append(_log_errors(log, errors, slow[-1]))
     slow_errors = np.concatenate(slow, axis=1)
     total = np.array([log.rms_mrad for log in logs])
@@ -115,8 +114,9 @@ def rivals(fitted: Sequence[ServoLog], log: ServoLog, *, slow: bool = False) -> 
     goal = np.concatenate([other.goal[part] for other, part in chosen])
     position = np.concatenate([other.position[part] for other, part in chosen])
     offset = float(np.mean(position - goal))
-    line = predict_linear(goal[:, None], position[:, None], log.goal[:, None])[:, 0]
-    return np.stack([log.goal, log.goal + offset, line])
+    design = np.column_stack([np.ones(len(goal)), goal])
+    constant, slope = np.linalg.lstsq(design, position, rcond=None)[0]
+    return np.stack([log.goal, log.goal + offset, constant + slope * log.goal])
 
 
 def split_logs(

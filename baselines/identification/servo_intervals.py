@@ -46,18 +46,18 @@ def half_widths(problem: ServoProblem, z: Array, free: IntArray) -> Array:
     by_steps = problem.with_steps(0.5 * STEP_S).residual(z, thinned=False) - r
     changes = np.stack([by_steps, *_changes_by_starts(problem, z, r)], axis=-1)
     r[len(r) - PRIORS :] = problem.weight  # expected deviation of a prior
-    at_bound = (z[free] - problem.lower[free] < _BOUND_MARGIN) | (
-        problem.upper[free] - z[free] < _BOUND_MARGIN
-    )
+    margin = np.minimum(z[free] - problem.lower[free], problem.upper[free] - z[free])
+    at_bound = margin < _BOUND_MARGIN
     inner = np.flatnonzero(~at_bound)
     widths = np.zeros(len(free))
     widths[inner] = _widths(problem, J[:, inner], r, changes, len(free))
     for j in np.flatnonzero(at_bound):
-        widths[j] = _widths(problem, J[:, np.append(inner, j)], r, changes, len(free))[-1]
+        columns = np.append(inner, j)
+        widths[j] = _widths(problem, J[:, columns], r, changes, len(free))[-1]
     return widths
 
 
-def _widths(problem: ServoProblem, J: Array, r: Array, changes: Array, num_free: int) -> Array:
+def _widths(problem: ServoProblem, J: Array, r: Array, changes: Array, k: int) -> Array:
     """Half-widths of some parameters with derivatives J, (N, p) to (p,).
 
     Args:
@@ -65,14 +65,14 @@ def _widths(problem: ServoProblem, J: Array, r: Array, changes: Array, num_free:
         J: Derivatives of the residuals, (N, p).
         r: Residuals, (N,).
         changes: Changes of the residuals by steps, then by each start, (N, 1 + starts).
-        num_free: Number of all estimated parameters.
+        k: Number of all estimated parameters.
     """
     blocks = [_blocks(problem.logs, seconds) for seconds in _BLOCKS_S]
     variance = np.max([cluster_variance(J, r, block) for block in blocks], axis=0)
     shifts = np.linalg.lstsq(J, changes, rcond=1e-8)[0]
     variance += np.sum(shifts[:, 1:] ** 2, axis=1)
     clusters = len(np.unique(blocks[-1]))
-    quantile = float(student.ppf(0.975, max(clusters - num_free, _LEAST_FREEDOM)))
+    quantile = float(student.ppf(0.975, max(clusters - k, _LEAST_FREEDOM)))
     return quantile * np.sqrt(variance) + 2.0 * np.abs(shifts[:, 0])
 
 

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -80,8 +80,7 @@ class ServoLog:
 
     def part(self, rows: slice) -> "ServoLog":
         """Log of some of the rows."""
-        tables = {field.name: getattr(self, field.name) for field in fields(self)}
-        arrays = {name: own[rows] for name, own in tables.items() if isinstance(own, np.ndarray)}
+        arrays = {k: v[rows] for k, v in vars(self).items() if isinstance(v, np.ndarray)}
         return replace(self, **arrays)
 
     def external_torque(self, q: Array) -> Array:
@@ -345,10 +344,8 @@ def _require_plausible_goal(path: Path, log: ServoLog) -> None:
         )
     torque = log.external_torque(log.position)[log.enabled]
     error = goal - position
-    if (
-        min(np.ptp(torque), np.ptp(error)) > 0.0
-        and np.corrcoef(error, torque)[0, 1] > _CONTRADICTING_CORRELATION
-    ):
+    varies = min(np.ptp(torque), np.ptp(error)) > 0.0
+    if varies and np.corrcoef(error, torque)[0, 1] > _CONTRADICTING_CORRELATION:
         raise ConfigurationError(
             f"{path}: the joint goes beyond its goal against the load; are goal and position"
             " exchanged, or is a sign or the zero (hanging down) wrong?"

@@ -136,7 +136,7 @@ class ServoProblem:
         return replace(self, replays=tuple(prepare(log, longest_s) for log in self.logs))
 
     def with_parts(self, seconds: float) -> "ServoProblem":
-        """Replays of short parts, each from the measured angle and speed at its first row.
+        """Problem of short parts, each replayed from measured angle and speed at its first row.
 
         A short replay deviates little with wrong parameters, so that its least squares have hardly
         any local minima [Bock1983]. A long replay then starts close to its own minimum.
@@ -149,9 +149,8 @@ class ServoProblem:
             for first, last in itertools.pairwise(edges):
                 if last - first >= _FEWEST_ROWS_OF_PART:
                     part = log.part(slice(first, last + 1))
-                    parts.append(
-                        Replay.from_log(part, float(speed[first]), longest_s=_COARSE_STEP_S)
-                    )
+                    start = float(speed[first])
+                    parts.append(Replay.from_log(part, start, longest_s=_COARSE_STEP_S))
         return replace(self, replays=tuple(parts))
 
     @property
@@ -184,8 +183,9 @@ class ServoProblem:
                 for log in self.logs
             ]
             # torque of a servo without limit
-            largest = float(np.concatenate(torques).max()) / self.scale[INDEX["torque_limit"]]
-            effects.append({"torque_limit": _FIRST_LIMIT_SHARE * largest})
+            largest = float(np.concatenate(torques).max())
+            limit = largest / self.scale[INDEX["torque_limit"]]
+            effects.append({"torque_limit": _FIRST_LIMIT_SHARE * limit})
         effects.append({"static_friction": 0.5, "stribeck_speed": 1.0})
         return effects
 
@@ -269,7 +269,8 @@ def prepare(log: ServoLog, longest_s: float = STEP_S) -> Replay:
     speed, _ = log.derivatives()
     if np.abs(speed[:FIRST_ROWS]).max() > MOVING:
         return Replay.from_log(log, float(speed[0]), longest_s=longest_s)
-    return Replay.from_log(log, 0.0, float(np.mean(log.position[:FIRST_ROWS])), longest_s)
+    angle = float(np.mean(log.position[:FIRST_ROWS]))
+    return Replay.from_log(log, 0.0, angle, longest_s)
 
 
 def _switches(log: ServoLog) -> IntArray:

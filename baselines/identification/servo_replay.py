@@ -79,7 +79,7 @@ class Replay:
         Args:
             log: The log.
             speed: Speed at the first row [rad/s].
-            angle: Angle at the first row [rad]; None for that of the log.
+            angle: Angle at the first row [rad]; None for the logged one.
             longest_s: Longest step [s].
         """
         step = np.diff(log.time)
@@ -114,7 +114,7 @@ class Replay:
         """Share of each step after the torque is switched, (N − 1, s); 0 where it is not.
 
         Args:
-            lead: Time from the switch to the first row that contains it, at most a row [s].
+            lead: Time from the switch to the first row that contains it, at most one row [s].
         """
         step = np.diff(self.log.time)[:, None]
         count = self.middle.shape[1]

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from baselines.identification.result_files import save_result
+from baselines.identification.results import save_result
 from baselines.identification.servo_fit import ServoFit
 from baselines.identification.servo_holdout import ServoHoldout
 from baselines.identification.servo_log import ServoLog
@@ -76,7 +76,7 @@ class ServoIdentification(Model):
 
     def value(self, name: str) -> float | None:
         """An estimate by its name, as in `servo_replay.NAMES`."""
-        return next(parameter.value for parameter in self.parameters if parameter.name == name)
+        return next(p.value for p in self.parameters if p.name == name)
 
     def settings(self) -> dict[str, Any]:
         """Settings of the joint for `JointSettings`, with the first gain and without a spring."""
@@ -84,13 +84,13 @@ class ServoIdentification(Model):
         inertia = self.value("rotor_inertia")
         if inertia:
             settings["rotor_inertia"] = _four_digits(inertia)
-        settings |= {name: _four_digits(self.value(name) or 0.0) for name in _FRICTION}
+        settings |= {name: _four_digits(self.value(name)) for name in _FRICTION}
         if settings["static_friction"]:
-            settings["stribeck_speed"] = _four_digits(self.value("stribeck_speed") or 0.0)
+            settings["stribeck_speed"] = _four_digits(self.value("stribeck_speed"))
         if self.gains:
             settings["servo"] = {
                 "position_gain": _four_digits(self.gains[0].position_gain_nm_per_rad),
-                "velocity_gain": _four_digits(self.value("motor_damping") or 0.0),
+                "velocity_gain": _four_digits(self.value("motor_damping")),
             }
             limit = self.value("torque_limit")
             if limit is not None:
@@ -107,7 +107,8 @@ class ServoIdentification(Model):
             register = self.gains[0].register_value
             value = "as in the logs" if register is None else f"{register:g}"
             comment = f"gain register {value}{supply}"
-        return save_result(self, folder, head, [yaml_line(self.joint, self.settings(), comment)])
+        line = yaml_line(self.joint, self.settings(), comment)
+        return save_result(self, folder, head, [line])
 
 
 def describe_servo(
@@ -140,7 +141,7 @@ def describe_servo(
             for register, volts in registers
         ),
         parameters=parameters,
-        untold=tuple(_undetermined_quantities(fit, parameters)),
+        untold=tuple(_limitations(fit, parameters)),
         supply_v=None if supply == 1.0 else supply,
         held_out=held_out,
     )
@@ -191,7 +192,7 @@ def _parameter(fit: ServoFit, name: str, supply: float) -> ServoParameter:
     )
 
 
-def _undetermined_quantities(fit: ServoFit, parameters: Sequence[ServoParameter]) -> list[str]:
+def _limitations(fit: ServoFit, parameters: Sequence[ServoParameter]) -> list[str]:
     """Quantities that the logs do not determine, each with its reason and its cure."""
     lines = []
     has_torque = any(log.enabled.any() for log in fit.logs)
@@ -211,20 +212,18 @@ def _undetermined_quantities(fit: ServoFit, parameters: Sequence[ServoParameter]
     if has_torque and by_name["torque_limit"].value is None:
         lines.append("the torque limit: the servo never reaches it; log a fast motion or the PWM")
     wide = [
-        f"{parameter.name} (± {parameter.half_width:.2g} {parameter.unit})"
-        for parameter in estimated
-        if parameter.half_width is not None and not parameter.is_told
+        f"{p.name} (± {p.half_width:.2g} {p.unit})"
+        for p in estimated
+        if p.half_width is not None and not p.is_told
     ]
     if wide:
         lines.append(
             f"with less than half their value: {', '.join(wide)}; log faster motions, both sides of"
             " approach, and a swing with the torque off"
         )
-    without_influence = [
-        parameter.name for parameter in estimated if np.isinf(fit.half(parameter.name))
-    ]
-    if without_influence:
-        lines.append(f"{', '.join(without_influence)}: nothing in these logs depends on it alone")
+    free = [p.name for p in estimated if np.isinf(fit.half(p.name))]
+    if free:
+        lines.append(f"{', '.join(free)}: nothing in these logs depends on it alone")
     if by_name["static_friction"].value is None:
         lines.append("Stribeck friction: it does not lower the error")
     if fit.half("load_friction") > _LARGEST_HALF_WIDTH * USUAL_LOSS[1]:
@@ -236,6 +235,6 @@ def _undetermined_quantities(fit: ServoFit, parameters: Sequence[ServoParameter]
     return lines
 
 
-def _four_digits(value: float) -> float:
-    """A value that is not negative, as `joints.yaml` contains it."""
-    return float(f"{max(value, 0.0):.4g}")
+def _four_digits(value: float | None) -> float:
+    """A value for `joints.yaml`: four digits, not below zero, zero without an estimate."""
+    return float(f"{max(value or 0.0, 0.0):.4g}")

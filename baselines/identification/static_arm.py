@@ -72,7 +72,7 @@ class StaticArm:
             loaded.set_payload(1.0, place, model.body(body).name)
             self._loaded = loaded.constants.body
         if end_effector is not None:
-            site_or_body(model, end_effector)  # checks the name, although not all logs need it
+            site_or_body(model, end_effector)  # checks the name even if it is unused
         self._end_effector = end_effector
         self.ranges = np.column_stack(joint_ranges(model, joints))
 

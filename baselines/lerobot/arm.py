@@ -204,8 +204,8 @@ class LeRobotArm:
                 nothing changes.
         """
         desired = self._values("action", action)
-        commanded = self.units.value(self.compensator.command(self.units.angle(desired)))
-        clipped = np.clip(commanded, self.units.lowest, self.units.highest)
+        command = self.units.value(self.compensator.command(self.units.angle(desired)))
+        clipped = np.clip(command, self.units.lowest, self.units.highest)
         return {**action, **dict(zip(self._keys, clipped.tolist(), strict=True))}
 
     def link_angles(self, observation: Mapping[str, Any]) -> dict[str, Any]:
@@ -217,8 +217,8 @@ class LeRobotArm:
             ElasticError: The load overcomes a spring.
         """
         measured = self._values("observation", observation)
-        links = self.units.value(self.compensator.link_angle(self.units.angle(measured)))
-        return {**observation, **dict(zip(self._keys, links.tolist(), strict=True))}
+        link = self.units.value(self.compensator.link_angle(self.units.angle(measured)))
+        return {**observation, **dict(zip(self._keys, link.tolist(), strict=True))}
 
     def _values(self, kind: str, entries: Mapping[str, Any]) -> Array:
         """Values of the motors in an action or observation, (n,)."""

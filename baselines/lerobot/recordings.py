@@ -58,7 +58,7 @@ def robot_of(folder: Path) -> str:
     """
     robot = _read_info(folder).get("robot_type")
     if not isinstance(robot, str) or not robot:
-        raise ConfigurationError(f"{shorten(folder)} names no robot; name it by --robot")
+        raise ConfigurationError(f"{shorten(folder)} names no robot; use --robot")
     name = robot if robot.endswith("_follower") else f"{robot}_follower"
     return _ROBOT_TYPES.get(name, name)
 
@@ -154,9 +154,8 @@ def _read_info(folder: Path) -> Mapping[str, Any]:
     )
     features = content.get("features") if isinstance(content, Mapping) else None
     if not isinstance(features, Mapping):
-        raise ConfigurationError(
-            f"{shorten(path)} describes no features; record the data set again"
-        )
+        problem = f"{shorten(path)} describes no features; record the data set again"
+        raise ConfigurationError(problem)
     return content
 
 

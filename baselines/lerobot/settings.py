@@ -158,9 +158,8 @@ def motors_of(robot: str, use_degrees: bool | None = None) -> tuple[Motor, ...]:
     if use_degrees is None:
         return motors
     if not use_degrees and any(motor.counts_per_turn is None for motor in motors):
-        raise ConfigurationError(
-            f"the motors of {robot} are in degrees always; leave use_degrees out"
-        )
+        problem = f"the motors of {robot} are in degrees always; leave use_degrees out"
+        raise ConfigurationError(problem)
     units: Units = "degrees" if use_degrees else "range"
     return tuple(
         motor.replace(units=motor.units if motor.units == "percent" else units) for motor in motors

@@ -51,7 +51,8 @@ class ArmProblem:
         hinges = hinges_of(model)
         log = None
         if options.log:
-            ranges = dict(zip(hinges, zip(*joint_ranges(model, hinges), strict=True), strict=True))
+            ends = zip(*joint_ranges(model, hinges), strict=True)
+            ranges = dict(zip(hinges, ends, strict=True))
             log = read_log(Path(options.log[0]), ranges, options.measured_by)
         joints = commanded_hinges(model) if log is None else log.joints
         arm = StaticArm(model, joints, options.end_effector, options.payload)
@@ -62,7 +63,8 @@ class ArmProblem:
                 f"measured is taken to be {arm.end_effector!r}; --end-effector names another site"
                 " or body"
             )
-        problem = cls(options, arm, log, _elastic_joints(options.joints, log.joints), seed)
+        elastic = _elastic_joints(options.joints, log.joints)
+        problem = cls(options, arm, log, elastic, seed)
         if options.log and not problem.has_unknown_geometry:
             require_poses(problem.model(log))
         return problem
@@ -74,8 +76,9 @@ class ArmProblem:
 
     def model(self, log: PoseLog) -> PoseModel:
         """The poses of a log as a function of the unknowns."""
+        frame = self.options.frame
         has_payload = self.options.payload is not None
-        unknowns = PoseUnknowns.from_log(log, self.elastic, self.options.frame, has_payload)
+        unknowns = PoseUnknowns.from_log(log, self.elastic, frame, has_payload)
         return PoseModel(self.arm, log, unknowns)
 
 

@@ -125,11 +125,14 @@ class Bench(Model):
         if path == _PACKAGE_CONFIG:
             console.print(f"there is no {DEFAULT_CONFIG}; these are the rollouts of the package")
         if self.config is None:  # the user did not name it
-            config = load_without_code(path, BenchConfig, f"name it: elastic bench {path}")
+            cure = f"name it: elastic bench {path}"
+            config = load_without_code(path, BenchConfig, cure)
         else:
             config = load_yaml(path, BenchConfig)
-        with run_folder(config.name, config.model_dump(mode="json"), None, self.output) as folder:
-            evaluations = run_conditions([case.condition for case in config.cases], console)
+        recorded = config.model_dump(mode="json")
+        conditions = [case.condition for case in config.cases]
+        with run_folder(config.name, recorded, None, self.output) as folder:
+            evaluations = run_conditions(conditions, console)
             figures = list[_Figure]()
             for case, evaluation in zip(config.cases, evaluations, strict=True):
                 figures += _figures(case, evaluation, config.margin)
@@ -211,21 +214,21 @@ def _problem(figure: _Figure, evaluation: Evaluation) -> str:
     metric, measured, bound = (figure[key] for key in ("metric", "measured", "bound"))
     terminations = [episode["termination"] for episode in evaluation.episodes]
     if failures := dict.fromkeys(filter(None, terminations)):
-        number = len(evaluation.episodes)
-        who = "the episode" if number == 1 else f"{evaluation.num_failed} of {number} episodes"
+        who = f"{evaluation.num_failed} of {len(terminations)} episodes"
+        who = "the episode" if len(terminations) == 1 else who
         return f"{metric} has no value: {who} ended as {' and '.join(map(repr, failures))}"
     if measured is None:
         return f"{metric} of this episode is not a number"
     if bound is None:
         cure = "nothing was accepted yet; --update accepts it"
-        return f"{metric} is {_figure_text(measured)}, and {cure}"
-    if float(_figure_text(abs(measured))) <= bound:
+        return f"{metric} is {_text(measured)}, and {cure}"
+    if float(_text(abs(measured))) <= bound:
         return ""
     worse = f" ({_change(measured, figure['accepted'])})" if figure["accepted"] else ""
-    return f"{metric} is {_figure_text(measured)}{worse}, at most {_figure_text(bound)} is accepted"
+    return f"{metric} is {_text(measured)}{worse}, at most {_text(bound)} is accepted"
 
 
-def _figure_text(figure: float) -> str:
+def _text(figure: float) -> str:
     """Return a figure as it is accepted and printed."""
     return f"{figure:.4g}"
 
@@ -255,7 +258,7 @@ def _accept(path: Path, evaluations: list[Evaluation]) -> int:
         last = places[-1][0]
         for place, (key, _) in zip(places, pairs, strict=True):
             if (measured := _score(evaluation, key.value)) is not None:
-                changes[place] = _figure_text(measured.value)
+                changes[place] = _text(measured.value)
     for (begin, end), value in sorted(changes.items(), reverse=True):
         text = text[:begin] + (value if end > begin else f" {value}") + text[end:]
     write_whole(path.resolve(), text.encode())  # the user named it, maybe by a link
@@ -282,16 +285,16 @@ def _table(figures: list[_Figure]) -> Table:
     for case, case_figures in group_by(figures, lambda figure: figure["case"]).items():
         rows.append(Row((case,), kind="heading"))
         for figure in case_figures:
-            measured, bound, accepted = (figure[key] for key in ("measured", "bound", "accepted"))
+            numbers = [figure[key] for key in ("measured", "bound", "accepted")]
+            measured, bound, accepted = numbers
             verdict = "falls short" if figure["problem"] else "kept"
             if measured is not None and bound is None:
                 verdict = "new"
             elif measured is not None and abs(measured) < 2.0 * abs(accepted) - bound:
                 verdict = "better"
-            numbers = (measured, bound, accepted)
-            text, *limits = ["-" if number is None else _figure_text(number) for number in numbers]
+            text, *limits = ["-" if n is None else _text(n) for n in numbers]
             change = _change(measured, accepted)
-            interval = ", ".join(map(_figure_text, figure["interval"] or ())) or "-"
+            interval = ", ".join(map(_text, figure["interval"] or ())) or "-"
             rows.append(Row((figure["metric"], verdict, text, change, *limits, interval)))
     title = "short rollouts against what was accepted"
     return Table(heads, tuple(rows), title=title, caption="--update accepts what is better.")

@@ -39,12 +39,10 @@ COMMANDS = (
     "identify evaluate compare train iterate export bench speed margins play view robot hardware"
     " lerobot hub demo"
 )
-"""Modules of this folder, each with a class of that name: its fields are options, `run` works."""
+"""Modules of this folder; each has a class of its name, with fields for options and `run`."""
 
 CONSOLE = PlainConsole()
 """The console of the commands."""
-
-
 _REPEAT_S = 2.0
 """Time after a signal in which further signals do not interrupt the end of the program."""
 
@@ -58,12 +56,12 @@ def _print_end(message: str, error: BaseException, prefix: str = "") -> None:
 
 def _print_failure(error: Exception) -> int:
     """Print the message of a failure, and return its exit code."""
-    explanation = explain(error)
-    if explanation is None:
+    result = explain(error)
+    if result is None:
         sys.stderr.write(traceback_text(error))
         kind = type(error).__name__
-        explanation = f"this is a defect of elastic-env, please report it: {kind}", DEFECT
-    message, code = explanation
+        result = f"this is a defect of elastic-env, please report it: {kind}", DEFECT
+    message, code = result
     _print_end(message, error, "error: ")
     if runs_in_workflow():
         CONSOLE.print(annotation(message))
@@ -119,7 +117,8 @@ def _parse(arguments: list[str]) -> Any:
     from train.commands.options import name_options
 
     name = arguments[0]
-    options = getattr(importlib.import_module(f"train.commands.{name}"), name.capitalize())
+    module = importlib.import_module(f"train.commands.{name}")
+    options = getattr(module, name.capitalize())
 
     def command(values: Any) -> Any:
         return values
@@ -178,7 +177,8 @@ def _parse_overview(arguments: list[str]) -> Any:
     """Print the help of all commands without loading them, or refuse an unknown command."""
     members: Any = []
     for name in COMMANDS.split():
-        kind = dataclasses.make_dataclass(name, [], namespace={"__doc__": _help_of(name)})
+        content = {"__doc__": _help_of(name)}
+        kind = dataclasses.make_dataclass(name, [], namespace=content)
         members.append(Annotated[kind, tyro.conf.subcommand(name)])
     union = functools.reduce(operator.or_, members)
     return tyro.cli(union, prog="elastic", description=_OVERVIEW, args=arguments, config=_STYLE)

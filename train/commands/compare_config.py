@@ -128,9 +128,11 @@ class CompareConfig(CodeNamingModel):
         protocol = self.model_dump(mode="json", exclude=irrelevant)
         walks = environment(self.env).walks
         scenarios = [make_scenario(name, walks, self.ranges) for name in self.scenarios]
-        protocol["scenarios"] = [scenario.model_dump(mode="json") for scenario in scenarios]
-        digest = hashlib.sha256(json.dumps(protocol, sort_keys=True).encode()).hexdigest()[:16]
-        versions = [f"{name} {installed_version(name)}" for name in ("elastic-env", "mujoco")]
+        protocol["scenarios"] = [s.model_dump(mode="json") for s in scenarios]
+        text = json.dumps(protocol, sort_keys=True)
+        digest = hashlib.sha256(text.encode()).hexdigest()[:16]
+        packages = ("elastic-env", "mujoco")
+        versions = [f"{name} {installed_version(name)}" for name in packages]
         return "; ".join([*versions, f"protocol {digest}"])
 
     @property
@@ -151,8 +153,9 @@ class CompareConfig(CodeNamingModel):
         require_known("policy of the figures", self.figure_policies, titles)
         known = self.scenarios
         require_known("scenario with episodes of its own", self.scenario_episodes, known)
-        require_known("reference with scenarios of its own", self.reference_scenarios, references)
-        for name, scenarios in self.reference_scenarios.items():
+        scenarios_of = self.reference_scenarios
+        require_known("reference with scenarios of its own", scenarios_of, references)
+        for name, scenarios in scenarios_of.items():
             require_known(f"scenario of {name!r}", scenarios, known)
         if duplicates := _duplicates(references):
             yield f"the reference {quote(duplicates[0])} stands twice; leave out one of them"
@@ -160,7 +163,8 @@ class CompareConfig(CodeNamingModel):
             require_known(f"scenario of the group {name!r}", scenarios, known)
             if name in known:
                 yield f"group {name!r} must have a name that no scenario has"
-        if self.leaderboard and (self.sweep or self.map or environment(self.env).is_real):
+        is_real = environment(self.env).is_real
+        if self.leaderboard and (self.sweep or self.map or is_real):
             yield "a leaderboard is of simulated cells without a sweep or a map; leave these out"
 
     def _map_problems(self) -> Iterator[str]:

@@ -86,7 +86,8 @@ def compare(
         board = []
         if config.leaderboard:
             console.print("measuring the time of every policy, in turn")
-            board = standings(evaluations, config.groups, step_times(conditions), config.origin)
+            times = step_times(conditions)
+            board = standings(evaluations, config.groups, times, config.origin)
             board = append_standings(published, board) if published else board
         results = _results(config, evaluations, folder, board, report)
         files += _write_results(results, config.figure_policies, figure_format)
@@ -118,9 +119,9 @@ def _results(
 
 
 def _write_results(
-    results: Results, figure_policies: Sequence[str], figure_format: plots.FigureFormat
+    results: Results, policies: Sequence[str], figure_format: plots.FigureFormat
 ) -> list[Path]:
-    """Write the tables and figures of a comparison; return their files."""
+    """Write the tables, and figures with time series of some policies; return their files."""
     folder = results.folder
     cells = merge_seeds(results.evaluations)
     files = []
@@ -131,7 +132,7 @@ def _write_results(
         files += draw_maps(results.maps, folder, figure_format)
         files.append(write_maps(results.maps, folder / "map.csv"))
     else:
-        files += draw_figures(cells, folder, figure_policies, results.swept, figure_format)
+        files += draw_figures(cells, folder, policies, results.swept, figure_format)
     if results.standings:
         files += write_leaderboard(results.standings, folder)
     if results.changes:

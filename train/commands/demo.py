@@ -131,11 +131,11 @@ _TESTBED = "the paper's testbed experiments, Figs. 5 and 6"
 _WALKS = "the paper's walks, Figs. 7 and 8: largest roll and pitch"
 
 
-def _report(testbed_rows: Rows, pictures: Sequence[Path], motion: Cells, walks: Cells) -> Page:
+def _report(rows: Rows, pictures: Sequence[Path], motion: Cells, walks: Cells) -> Page:
     """Return a page with the tables of the demonstration, and with curves that can be zoomed."""
     page = Page("Demonstration", f"{_INTRODUCTION}.")
     page.section("One joint, at rest")
-    page.add("table", Table.plain(_HEAD, testbed_rows))
+    page.add("table", Table.plain(_HEAD, rows))
     for picture in pictures:
         page.add("picture", picture, picture.stem.replace("_", " "))
     page.section("One joint, in motion", TEXTS["curves"])

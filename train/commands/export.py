@@ -58,7 +58,7 @@ class C(Output):
 
     The header of an arm has the functions of `PositionCompensator`: command, link_angle, torque,
     payload, ramp, limits and friction. Call begin(&arm) once, then command(&arm, q, q_dot, q_ddot,
-    out). Its first lines give units, signs, version and digests. The macro PREFIX_TEST adds a test
+    out). The first lines give units, signs, version and digests. The macro PREFIX_TEST adds a test
     vector, see docs/export.md.
 
     Example: elastic export c arm.urdf --joints joints.yaml -o arm.h

@@ -13,26 +13,26 @@ from train.runs.progress import show_progress
 
 
 def judge_poses(
-    judged: HoldoutProblem, options: HoldoutOptions, console: Console, seed: int
+    problem: HoldoutProblem, options: HoldoutOptions, console: Console, seed: int
 ) -> HeldOut | None:
     """Return held-out errors; if nothing is held out, print the reason and return None.
 
     Args:
-        judged: Poses, and ways to predict them.
+        problem: Poses, and ways to predict them.
         options: Share or folds.
         console: Console for progress, and for the reason.
         seed: Seed of the draw.
     """
     if not options.holdout:
         return None
-    parts = split(len(judged.theta), options.holdout, options.folds, seed)
-    if reason := judged.shortage(parts):
+    parts = split(len(problem.theta), options.holdout, options.folds, seed)
+    if reason := problem.shortage(parts):
         console.print(f"nothing is held out: {reason}")
         return None
     try:
-        work = {"held-out fits": num_fits(judged, parts)}
+        work = {"held-out fits": num_fits(problem, parts)}
         with show_progress(console, work, transient=True) as show:
-            return judge(judged, parts, seed, partial(show, 0))
+            return judge(problem, parts, seed, partial(show, 0))
     except ElasticError as error:
         console.print(f"nothing is held out: without some poses {error}")
         return None
@@ -44,12 +44,12 @@ def print_held_out(held_out: HeldOut, console: Console) -> None:
     rows = []
     for error in held_out.errors:
         figures = (error.rms, error.mean, error.worst)
-        rows.append([error.name, *(_figure_text(figure, held_out) for figure in figures)])
+        rows.append([error.name, *(_text(figure, held_out) for figure in figures)])
     title = f"error of {held_out.of} at {held_out.held_out} poses that were held out"
     head = ["prediction", f"rms [{held_out.unit}]", "mean", "worst"]
     console.print(make_table(title, head, rows, box=box.SIMPLE))
     points = [
-        f"{point.poses} poses {_figure_text(point.rms, held_out)} {held_out.unit}"
+        f"{point.poses} poses {_text(point.rms, held_out)} {held_out.unit}"
         for point in held_out.curve
     ]
     console.print(f"by the number of poses: {', '.join(points)}")
@@ -57,10 +57,10 @@ def print_held_out(held_out: HeldOut, console: Console) -> None:
 
 def verdict(held_out: HeldOut) -> str:
     """Return held-out errors in a sentence; a rival that is ahead comes first."""
-    rigid = _figure_text(held_out.errors[0].rms, held_out)
-    identified = _figure_text(held_out.errors[-1].rms, held_out)
+    rigid = _text(held_out.errors[0].rms, held_out)
+    identified = _text(held_out.errors[-1].rms, held_out)
     rival = held_out.best_rival
-    best = f"{_figure_text(rival.rms, held_out)} {held_out.unit}"
+    best = f"{_text(rival.rms, held_out)} {held_out.unit}"
     if held_out.is_ahead:
         return (
             f"held out: {rigid} {held_out.unit} rms as given, {identified} {held_out.unit}"
@@ -77,5 +77,5 @@ def number_or_dash(value: float | None, form: str = ".4g", scale: float = 1.0) -
     return "–" if value is None else format(scale * value, form)
 
 
-def _figure_text(value: float, held_out: HeldOut) -> str:
+def _text(value: float, held_out: HeldOut) -> str:
     return f"{value:.3f}" if held_out.unit == "N·m" else f"{value:.2f}"

@@ -90,7 +90,7 @@ class Identify(IdentificationRun):
             console.print(result_table(results[0]))
             if self.testbed.repeats > 1:
                 numbered = enumerate(results, self.seed)
-                rows = [{"seed": seed, **result.model_dump()} for seed, result in numbered]
+                rows = [{"seed": seed, **r.model_dump()} for seed, r in numbered]
                 files.append(write_records(rows, folder / "repeats.csv"))
                 truth = float(envs[0].unwrapped.truth().model.stiffness[0])
                 console.print(_repeats_summary(pd.DataFrame(rows), results, truth))
@@ -105,18 +105,16 @@ class Identify(IdentificationRun):
                 "an identification on hardware needs the link's angle: name the IMU with --imu-port"
             )
         if self.testbed.stiffness is not None or self.testbed.repeats > 1:
-            raise ConfigurationError(
-                "stiffness and repeats are of a simulated joint; leave them out on hardware"
-            )
+            problem = "stiffness and repeats are of a simulated joint; leave them out on hardware"
+            raise ConfigurationError(problem)
         if self.testbed.second_mass is not None and not hardware.get("confirm", True):
-            raise ConfigurationError(
-                "somebody must change the mass between the runs: a second_mass excludes --yes"
-            )
+            problem = "somebody must change the mass between the runs: a second_mass excludes --yes"
+            raise ConfigurationError(problem)
 
 
 @contextmanager
 def _show_share(hardware: Mapping[str, Any], console: Console) -> Iterator[Callable[[float], None]]:
-    """Display of the finished share of the work, which the function within sets."""
+    """Show progress, and yield a function that takes the finished share of the work."""
     work = "visiting static positions"
     if hardware:
         console.print(f"{work} at {hardware['port']}")
@@ -167,7 +165,7 @@ def identified_environments(options: Identify) -> list[Any]:
         }
     arguments["reference"] = {"kind": "hold", "positions": options.testbed.positions}
     arguments["vectorization_mode"] = "vector_entry_point"
-    return [gymnasium.make_vec(name, pendulum=pendulum, **arguments) for pendulum in pendulums]
+    return [gymnasium.make_vec(name, pendulum=p, **arguments) for p in pendulums]
 
 
 def _repeats_summary(table: pd.DataFrame, results: Sequence[Identification], truth: float) -> str:

@@ -6,12 +6,7 @@ from rich import box
 from rich.table import Table
 
 from baselines.identification.arm_fit import LARGE_RESIDUAL_RATIO, USUAL_NOISE, noise_text
-from baselines.identification.arm_result import (
-    NEGATIVE,
-    ArmIdentification,
-    JointStiffness,
-    Source,
-)
+from baselines.identification.arm_result import NEGATIVE, ArmIdentification, JointStiffness, Source
 from train.commands.held_out import number_or_dash
 from train.runs.console import make_table
 
@@ -31,9 +26,10 @@ def result_table(result: ArmIdentification) -> Table:
     if joints[0].planned_half_width is not None:
         columns["planned ±"] = [percent(joint.planned_half_width) for joint in joints]
     if not result.friction_is_noise:
-        columns["F [N·m]"] = [number_or_dash(joint.friction_nm, ".2f") for joint in joints]
-    columns["o [mrad]"] = [number_or_dash(joint.offset_rad, ".2f", 1e3) for joint in joints]
-    title = f"K [N·m/rad] from {result.poses} poses, by {result.measurement.replace('_', ' ')}"
+        columns["F [N·m]"] = [number_or_dash(j.friction_nm, ".2f") for j in joints]
+    columns["o [mrad]"] = [number_or_dash(j.offset_rad, ".2f", 1e3) for j in joints]
+    measurement = result.measurement.replace("_", " ")
+    title = f"K [N·m/rad] from {result.poses} poses, by {measurement}"
     rows = zip(*columns.values(), strict=True)
     table = make_table(title, list(columns), rows, box=box.SIMPLE, padding=(0, 1, 0, 0))
     for column in table.columns:
@@ -81,7 +77,7 @@ def remarks(result: ArmIdentification) -> Iterator[str]:
     uncertain = [joint for joint in joints if joint.reason]
     if uncertain and joints[0].planned_half_width is None:
         yield "--plan 20 proposes poses that tell more"
-    unimproved = [joint.joint for joint in uncertain if (joint.planned_half_width or 0.0) > 1.0]
+    unimproved = [j.joint for j in uncertain if (j.planned_half_width or 0.0) > 1.0]
     if unimproved:
         yield (
             f"no proposed pose tells {', '.join(unimproved)}: gravity must load the joint, and the"

@@ -57,12 +57,12 @@ def identify_geometry(
         with show_progress(console, {"fits": 1}, transient=True) as show:
             fit = fit_geometry(problem)
             show(0, 1)
-        held_out = judge_poses(
-            HoldoutProblem.from_geometry(problem), options.judged, console, run.seed
-        )
+        holdout = HoldoutProblem.from_geometry(problem)
+        held_out = judge_poses(holdout, options.judged, console, run.seed)
         result = describe_geometry(fit, held_out)
         files = result.save(folder, correct_model(spec, tree, fit))
-        files.append(draw_geometry(result, folder / f"identification.{run.figure_format}"))
+        picture = folder / f"identification.{run.figure_format}"
+        files.append(draw_geometry(result, picture))
     show_result(result, console)
     for path in files:
         console.print(f"wrote {path}")
@@ -115,11 +115,8 @@ def show_result(result: GeometryIdentification, console: Console) -> None:
     if result.held_out is not None:
         print_held_out(result.held_out, console)
     rows = []
-    friction = {
-        parameter.name: parameter.value if parameter.is_told else None
-        for parameter in result.parameters
-        if parameter.kind == "friction"
-    }
+    frictions = [p for p in result.parameters if p.kind == "friction"]
+    friction = {p.name: p.value if p.is_told else None for p in frictions}
     for joint in result.joints:
         stiffness = number_or_dash(joint.stiffness_nm_per_rad).replace("inf", "rigid")
         ends = (joint.stiffness_low_nm_per_rad, joint.stiffness_high_nm_per_rad)
@@ -135,9 +132,9 @@ def show_result(result: GeometryIdentification, console: Console) -> None:
             f"{result.numbers} measured numbers for {len(result.parameters)} parameters: most rests"
             " on the priors; log more poses"
         )
-    undetermined = result.prior_parameters
-    if undetermined:
+    names = result.prior_parameters
+    if names:
         console.print(
-            f"{len(undetermined)} of {len(result.parameters)} parameters keep their prior, as the"
-            f" poses do not tell them: {list_names(undetermined)}"
+            f"{len(names)} of {len(result.parameters)} parameters keep their prior, as the"
+            f" poses do not tell them: {list_names(names)}"
         )

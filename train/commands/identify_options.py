@@ -58,9 +58,8 @@ class JointOptions(Model):
     @model_validator(mode="after")
     def _masses_differ(self) -> Self:
         if self.second_mass == 1.0:
-            raise ValueError(
-                "second_mass must differ from 1: two equal masses do not separate anything"
-            )
+            problem = "second_mass must differ from 1: two equal masses do not separate anything"
+            raise ValueError(problem)
         return self
 
 

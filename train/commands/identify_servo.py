@@ -55,8 +55,9 @@ def identify_servo(
         [read_servo_log(Path(path), load, servo.gain, servo.angles, joint) for path in group]
         for group in (paths, servo.unfitted)
     )
-    _require_all_or_none("supply voltage", [log.supply == 1.0 for log in (*logs, *unfitted)])
-    powered = [log for log in (*logs, *unfitted) if log.enabled.any()]
+    all_logs = [*logs, *unfitted]
+    _require_all_or_none("supply voltage", [log.supply == 1.0 for log in all_logs])
+    powered = [log for log in all_logs if log.enabled.any()]
     _require_all_or_none("gain", [log.gain is None for log in powered])
     inner = logs
     outer = unfitted
@@ -84,7 +85,8 @@ def identify_servo(
 def _require_no_poses(options: ArmOptions) -> None:
     """Refuse options that are for poses only, and several joints."""
     used = ("log", "robot", "joints", "servo", "markers", "judged")
-    unused = given_options(options, [name for name in ArmOptions.model_fields if name not in used])
+    others = [name for name in ArmOptions.model_fields if name not in used]
+    unused = given_options(options, others)
     if options.markers != GeometryOptions():
         unused.append("those of --geometry")
     unused += given_options(options.judged, ["folds"])
@@ -140,7 +142,8 @@ def show_result(result: ServoIdentification, console: Console) -> None:
         register = "" if gain.register_value is None else f" at gain {gain.register_value:g}"
         supply = "" if gain.supply_v is None else f", {gain.supply_v:.4g} V"
         value = f"{gain.position_gain_nm_per_rad:.4g}"
-        rows.append([f"k_p{register}{supply}", value, _width(gain.half_width), "N·m/rad", ""])
+        width = _width(gain.half_width)
+        rows.append([f"k_p{register}{supply}", value, width, "N·m/rad", ""])
     for parameter in result.parameters:
         if parameter.name != "position_gain" and parameter.value is not None:
             name = parameter.name
@@ -149,7 +152,8 @@ def show_result(result: ServoIdentification, console: Console) -> None:
             width = _width(parameter.half_width)
             value = f"{parameter.value:.4g}"
             rows.append([name, value, width, parameter.unit, parameter.remark])
-    title = f"servo from {len(result.logs)} logs, replayed within {result.rms_mrad:.1f} mrad rms"
+    error = f"{result.rms_mrad:.1f} mrad rms"
+    title = f"servo from {len(result.logs)} logs, replayed within {error}"
     head = ["parameter", "value", "95 %", "unit", "follows from"]
     console.print(make_table(title, head, rows, box=box.SIMPLE))
     console.print("the logs do not tell:")
@@ -165,7 +169,7 @@ def verdict(held_out: ServoHoldout) -> str:
     identified = held_out.errors[-1]
     rival = held_out.best_rival
     swing = ""
-    if held_out.has_torque_off and held_out.replay_mrad > _FAR_WORSE_RATIO * rival.rms_mrad:
+    if held_out.has_torque_off and held_out.replay_mrad > _WORSE_RATIO * rival.rms_mrad:
         swing = f"; with the torque off included the replay has {held_out.replay_mrad:.1f}"
     if identified.rms_mrad < rival.rms_mrad:
         return (
@@ -178,12 +182,12 @@ def verdict(held_out: ServoHoldout) -> str:
     )
 
 
-_FAR_WORSE_RATIO = 1.5
+_WORSE_RATIO = 1.5
 """Error of the replay with the torque off over the best rival's, from which it is named."""
 
 
 def fitted_logs(paths: Sequence[str], unfitted: Sequence[str], console: Console) -> list[str]:
-    """Logs of `--log` that are fitted: those that `--unfitted` names too are left out, and printed.
+    """Logs of `--log` to fit. Logs that `--unfitted` names too are left out, and printed.
 
     Two logs are the same if their paths or their contents are equal.
 

@@ -113,10 +113,10 @@ class Iterate(Model):
                 title = f"Learned on the robot, {self.scenario}"
                 chart = trials_chart(trials, condition.environment.judged, title)
                 files = [
-                    self._write_trials(trials, policy.names, folder / "trials.csv"),
+                    self._write(trials, policy.names, folder / "trials.csv"),
                     plots.draw_chart(chart, folder / f"trials.{self.figure_format}"),
                 ]
-                policies = self._save_offsets(env, policy, folder)
+                policies = self._save(env, policy, folder)
         console.print(trials_table(trials, condition))
         for path in files:
             console.print(f"wrote {path}")
@@ -139,7 +139,7 @@ class Iterate(Model):
             add(Trials(env, self.seed).play(policy, signals, policy.trials))
         return trials
 
-    def _write_trials(self, trials: Sequence[Trial], names: Sequence[str], path: Path) -> Path:
+    def _write(self, trials: Sequence[Trial], names: Sequence[str], path: Path) -> Path:
         """Write a row per robot and trial: measured errors and metrics."""
         columns = [f"measured_{name}" for name in names]
         rows = []
@@ -151,7 +151,7 @@ class Iterate(Model):
                 rows.append({**row, **dict(measured), **metrics})
         return write_records(rows, path)
 
-    def _save_offsets(self, env: Any, policy: IterativeLearner, folder: Path) -> list[Path]:
+    def _save(self, env: Any, policy: IterativeLearner, folder: Path) -> list[Path]:
         """Write the offsets of a single robot into the folder, of several into folders by seed."""
         model = env.unwrapped.assumed_model
         options = PolicyOptions(learned_base=self.base)
@@ -169,23 +169,22 @@ class Iterate(Model):
                 scenario=self.scenario,
                 training=provenance(seed),
             )
-            folders.append(folder if len(policy.tables) == 1 else folder / f"robot_{seed}")
+            is_one = len(policy.tables) == 1
+            folders.append(folder if is_one else folder / f"robot_{seed}")
             save_table(folders[-1], description, table)
         return folders
 
 
 def trials_table(trials: Sequence[Trial], condition: Condition) -> Table:
     """Metrics of every trial, means over the robots that did not fail, and failures."""
-    environment = condition.environment
-    title = f"{environment.title(condition.reference_name)}, {condition.scenario}"
-    head = ["trial", *(column.label for column in environment.judged), environment.failures]
+    env = condition.environment
+    title = f"{env.title(condition.reference_name)}, {condition.scenario}"
+    head = ["trial", *(column.label for column in env.judged), env.failures]
     rows = []
     for trial in trials:
         robots = pd.DataFrame(trial.metrics).loc[~trial.failed]
-        scores = [
-            number_interval(over_cells([np.array([robots[c.metric]])]), c)
-            for c in environment.judged
-        ]
+        means = [over_cells([np.array([robots[c.metric]])]) for c in env.judged]
+        scores = map(number_interval, means, env.judged)
         failed = f"{int(trial.failed.sum())} of {len(trial.failed)}"
         rows.append([str(trial.number), *scores, failed])
     return make_table(title, head, rows, left=0)

@@ -58,7 +58,8 @@ class Lerobot(Model):
         )
         arm = LeRobotArm(settings)
         recordings = read_recordings(self.dataset, self.episodes)
-        with run_folder("lerobot", self.model_dump(mode="json"), None, self.output) as folder:
+        recorded = self.model_dump(mode="json")
+        with run_folder("lerobot", recorded, None, self.output) as folder:
             for recording in recordings:
                 for log in joint_logs(recording, arm):
                     write_whole(folder / f"{log.name}.csv", log_text(log))

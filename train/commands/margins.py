@@ -66,7 +66,7 @@ class Margins(Model):
 
     def run(self, console: Console) -> None:
         """Bisect for each policy, and write the margins after each."""
-        chosen = [quantity for quantity in QUANTITIES if quantity.field in self.quantities]
+        chosen = [q for q in QUANTITIES if q.field in self.quantities]
         conditions = [
             Condition(
                 env="walker",
@@ -79,9 +79,8 @@ class Margins(Model):
         ]
         try_out(conditions)
         steps = num_steps(conditions)
-        totals = {
-            name: (self.halvings + 1) * n for name, n in zip(self.policies, steps, strict=True)
-        }
+        walks = self.halvings + 1
+        totals = {name: walks * n for name, n in zip(self.policies, steps, strict=True)}
         recorded = self.model_dump(mode="json", exclude={"output", "threads"})
         records: list[dict[str, Any]] = []
         with run_folder("margins", recorded, self.seed, self.output) as folder:
@@ -91,7 +90,7 @@ class Margins(Model):
                     starts = itertools.count(0, steps[number])
                     play = partial(self._play, starts, partial(show, number))
                     records += find_margins(condition, chosen, self.robots, self.halvings, play)
-                    rows = [{k: v for k, v in row.items() if k != "edges"} for row in records]
+                    rows = [{k: r[k] for k in r if k != "edges"} for r in records]
                     write_records(rows, files[0])
                     write_whole(files[1], json.dumps(records, indent=2) + "\n")
         title = f"worst / median edge of {self.robots} robots, {conditions[0].reference_name}"

@@ -99,8 +99,8 @@ class OnHardware(Model):
         if self.port is None and self.mounting is None:
             for name in ("imu_port", "yes", "patient"):
                 if getattr(self, name):
-                    cure = "name its servo's port too, with --port"
-                    raise ConfigurationError(f"{_option(name)} is for a real testbed: {cure}")
+                    cure = "is for a real testbed: name its servo's port too, with --port"
+                    raise ConfigurationError(f"{_option(name)} {cure}")
             return {}
         confirm = False if self.yes else None
         options = {"port": self.port, "imu_port": self.imu_port, "confirm": confirm}
@@ -147,7 +147,7 @@ class OnHardware(Model):
 def given_options(options: Model, names: Iterable[str]) -> list[str]:
     """Return the options that differ from their defaults, as users write them."""
     fields = type(options).model_fields
-    return [_option(name) for name in names if getattr(options, name) != fields[name].default]
+    return [_option(n) for n in names if getattr(options, n) != fields[n].default]
 
 
 @contextmanager

@@ -45,7 +45,8 @@ def play(
         MissingExtraError: The video writer is not installed.
     """
     mode = "human" if video is None else "rgb_array"
-    env: Any = gymnasium.make(condition.environment.id, render_mode=mode, **condition.arguments)
+    name = condition.environment.id
+    env: Any = gymnasium.make(name, render_mode=mode, **condition.arguments)
     task = env.unwrapped.task
     period = task.assumed_model.control_period_s
     with closing(env):
@@ -71,7 +72,8 @@ def steps_within(task: Any, max_s: float | None) -> int:
     """
     if max_s is None:
         return task.num_steps
-    return max(round(min(max_s / task.assumed_model.control_period_s, task.num_steps)), 1)
+    steps = max_s / task.assumed_model.control_period_s
+    return max(round(min(steps, task.num_steps)), 1)
 
 
 def _rehearse(policy: Any, condition: Condition, console: Console) -> None:
@@ -139,7 +141,7 @@ def _film(env: Any, episode: Iterable[_Step], period: float, video: Path, show: 
         else:
             _require_whole(video, frames)
     except BaseException:
-        video.unlink(missing_ok=True)  # an existing file is never overwritten
+        video.unlink(missing_ok=True)  # else it would block the next film
         raise
 
 

@@ -127,7 +127,7 @@ def try_robot(trial: Robot, console: Console) -> tuple[Path, list[Path]]:
     recorded = trial.model_dump(mode="json", exclude={"output", "figure_format", "video"})
     with run_folder("robot", recorded, trial.seed, trial.output) as folder:
         file = write_robot(arguments, folder)
-        comparison_config = CompareConfig(
+        setup = CompareConfig(
             name="robot",
             env=str(file),
             references=[trial.poses.model_dump(mode="json"), trial.motion],
@@ -135,10 +135,9 @@ def try_robot(trial: Robot, console: Console) -> tuple[Path, list[Path]]:
             policies=[PolicySpec(name=name) for name in POLICIES],
             seed=trial.seed,
         )
-        comparison = compare(
-            comparison_config, console, folder / "comparison", figure_format=trial.figure_format
-        )
-        errors = [_end_effector_errors(evaluation) for evaluation in comparison.evaluations]
+        output = folder / "comparison"
+        comparison = compare(setup, console, output, figure_format=trial.figure_format)
+        errors = [_end_effector_errors(e) for e in comparison.evaluations]
         shares = joint_shares(plant)
         files = [
             file,
@@ -172,9 +171,8 @@ def robot_arguments(trial: Robot) -> dict[str, Any]:
         arguments["joints"] = dict(read_mapping(Path(stiffness)))
     elif stiffness is not None:
         if not stiffness > 0.0:
-            raise ConfigurationError(
-                f"stiffness must be > 0 N·m/rad or a file of joints, got {quote(stiffness)}"
-            )
+            problem = f"stiffness must be > 0 N·m/rad or a file of joints, got {quote(stiffness)}"
+            raise ConfigurationError(problem)
         arguments["joints"] = {"*": stiffness}
     if trial.end_effector is not None:
         arguments["end_effector"] = trial.end_effector
@@ -213,9 +211,10 @@ def _gallery_arguments(name: str) -> dict[str, Any]:
         spec.compile()
         model = spec.to_xml()
     assumed = gallery_joints(name).items()
+    joints = {name: joint.model_dump(include=_ASSUMED) for name, joint in assumed}
     return {
         "model": model,
-        "joints": {joint: settings.model_dump(include=_ASSUMED) for joint, settings in assumed},
+        "joints": joints,
         "end_effector": end_effector,
         "home": dict(entry.home),
     }
@@ -278,7 +277,7 @@ def _films(trial: Robot, file: Path, folder: Path, console: Console) -> list[Pat
 def _errors_table(records: Sequence[dict[str, Any]]) -> Table:
     rows = []
     for motion in dict.fromkeys(record["motion"] for record in records):
-        errors = [1e3 * record["error_rms_m"] for record in records if record["motion"] == motion]
+        errors = [1e3 * r["error_rms_m"] for r in records if r["motion"] == motion]
         best = pd.Series(errors[1:]).min()  # ignores failed episodes
         ratio = best / errors[0] if errors[0] > 0.0 else np.nan
         share = "-" if np.isnan(ratio) else f"{100.0 * ratio:.1f} %"

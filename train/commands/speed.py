@@ -111,8 +111,7 @@ def measure_real_time(config: Speed, console: Console) -> Path:
     """Time a policy at the control rate, print its latencies, and write them as JSON."""
     recorded = config.model_dump(mode="json", include={"env", "policy", "seconds"})
     with run_folder("speed", recorded, 0, config.output) as folder:
-        length = f"{config.seconds:g} s"
-        console.print(f"recording an episode, then {length} against the clock")
+        console.print(f"recording an episode, then {config.seconds:g} s against the clock")
         figures = play_against_the_clock(config.env, config.policy, config.seconds)
         path = folder / "real_time.json"
         path.write_text(json.dumps(figures, indent=2) + "\n")
@@ -136,7 +135,8 @@ def measure_throughput(config: Speed, console: Console) -> Path:
         # so that a missing package fails before the work
         importlib.import_module("stable_baselines3")
     config.vector_loop(1, config.policy, residual=False)
-    recorded = config.model_dump(mode="json", exclude={"output", "profile", "real_time", "seconds"})
+    unused = {"output", "profile", "real_time", "seconds"}
+    recorded = config.model_dump(mode="json", exclude=unused)
     with run_folder("speed", recorded, None, config.output) as folder:
         console.print("measuring every contender in turn, round by round")
         results = measure(config, plain_progress(console))
@@ -150,8 +150,9 @@ def measure_throughput(config: Speed, console: Console) -> Path:
     title = f"{config.env}: control steps per second, medians of one interleaved run"
     rows = []
     for row in results:
-        figures = (str(row["num_envs"]), f"{row['steps_per_s']:,.0f}", f"{row['ratio']:.3f}")
-        rows.append((row["contender"], *figures, row["against"]))
+        worlds = str(row["num_envs"])
+        figures = (f"{row['steps_per_s']:,.0f}", f"{row['ratio']:.3f}")
+        rows.append((row["contender"], worlds, *figures, row["against"]))
     table = make_table(title, ["", "worlds", "steps/s", "ratio", "to"], rows)
     table.columns[-1].justify = "left"
     console.print(table)
@@ -199,7 +200,7 @@ def measure(config: Speed, progress: Callable[[float], None]) -> list[dict[str, 
 def _contenders(config: Speed) -> tuple[list[Contender], list[int]]:
     """Return contenders, and for each the number of its opponent.
 
-    An opponent of one contender only comes directly before or after it.
+    An opponent that only one contender has comes directly before or after it.
     """
     env = config.env
     policy = config.looped_policy

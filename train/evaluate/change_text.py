@@ -62,7 +62,8 @@ def percent_interval(estimate: Estimate, signed: bool = True) -> str:
 
 
 def _percent_digits(share: float, signed: bool, has_decimal: bool) -> str:
-    return f"{100.0 * share:{'+' if signed else ''}.{int(has_decimal)}f}".replace("-", "−")
+    sign = "+" if signed else ""
+    return f"{100.0 * share:{sign}.{int(has_decimal)}f}".replace("-", "−")
 
 
 def signed_interval(estimate: Estimate, verdict: str) -> str:

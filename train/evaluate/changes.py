@@ -6,6 +6,7 @@ compared with the base of the residuals, or without residuals with the first pol
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import compress
 from typing import Literal
 
 import numpy as np
@@ -156,7 +157,7 @@ def opponents(table: EpisodeTable) -> dict[str, list[str]]:
     policy.
     """
     families = table.members.values()
-    bases = dict.fromkeys(member.base for family in families for member in family.values())
+    bases = dict.fromkeys(m.base for family in families for m in family.values())
     result = {}
     for title in table.policies:
         others: Sequence[str | None] = list(bases) or table.policies[:1]
@@ -199,18 +200,16 @@ def change_of(table: EpisodeTable, scope: Scope, base: str, column: Column) -> C
     Raises:
         ValueError: A seed occurs twice, so that episodes cannot be paired.
     """
-    own_rows = table.rows_of(scope.policy, *scope.cells)
-    draws_robots = [
-        own_rows.loc[own_rows["cell"] == cell, "robot"].iloc[0] != "" for cell in scope.cells
-    ]
+    rows = table.rows_of(scope.policy, *scope.cells)
+    is_drawn = [rows.loc[rows["cell"] == cell, "robot"].iloc[0] != "" for cell in scope.cells]
     member = scope.first.member
     if member is None:
-        own_rows = episodes_as_robots(own_rows)
+        rows = episodes_as_robots(rows)
     cell_pairs = zip(table.cells_of_base(scope, base), scope.cells, strict=True)
     base_rows = pd.concat(
-        [table.rows_of(base, base_cell).assign(cell=cell) for base_cell, cell in cell_pairs]
+        [table.rows_of(base, other).assign(cell=cell) for other, cell in cell_pairs]
     )
-    pairs = EpisodesByRobot(pair(own_rows, base_rows, column.metric))
+    pairs = EpisodesByRobot(pair(rows, base_rows, column.metric))
     own_values = pairs.figures("mine")
     base_values = pairs.figures("base")
     robots = [values.shape[1] for values in own_values]
@@ -219,14 +218,14 @@ def change_of(table: EpisodeTable, scope: Scope, base: str, column: Column) -> C
     base_means = means_of_cells(base_values, once)[:, 0].T
 
     def relative(counts: Counts) -> Array:
-        sides = (means_of_cells(values, counts).T for values in (own_values, base_values))
+        sides = (means_of_cells(v, counts).T for v in (own_values, base_values))
         return change(*sides).T
 
     won, played = (
         [np.nan_to_num(values) for values in pairs.figures("won", statistic)]
         for statistic in ("sum", "count")
     )
-    falls, episodes = failures(own_rows)
+    falls, episodes = failures(rows)
     base_falls, base_episodes = failures(base_rows)
     return Change(
         **vars(scope),
@@ -235,8 +234,8 @@ def change_of(table: EpisodeTable, scope: Scope, base: str, column: Column) -> C
         column=column,
         is_judged=column in table.environment.judged,
         per_seed=change(own_means, base_means),
-        relative=count_episodes_apart(estimate(relative, robots), robots, draws_robots),
-        improvement=count_episodes_apart(improvement(won, played), robots, draws_robots),
+        relative=count_episodes_apart(estimate(relative, robots), robots, is_drawn),
+        improvement=count_episodes_apart(improvement(won, played), robots, is_drawn),
         mine=_mean_over_seeds(own_means),
         theirs=_mean_over_seeds(base_means),
         num_pairs=int(sum(values.sum() for values in played)),
@@ -249,18 +248,18 @@ def change_of(table: EpisodeTable, scope: Scope, base: str, column: Column) -> C
 
 
 def count_episodes_apart(
-    total: Estimate, units: Sequence[int], draws_robots: Sequence[bool]
+    total: Estimate, units: Sequence[int], is_drawn: Sequence[bool]
 ) -> Estimate:
     """Return an estimate that counts drawn robots and episodes of one robot apart.
 
     Args:
         total: Estimate that counts all of these units as robots.
         units: Robots or episodes of every cell.
-        draws_robots: True for every cell whose units are robots.
+        is_drawn: True for every cell whose units are robots.
     """
     if not total.robots:
         return total
-    robots = sum(n for n, is_drawn in zip(units, draws_robots, strict=True) if is_drawn and n > 1)
+    robots = sum(n for n in compress(units, is_drawn) if n > 1)
     return replace(total, robots=robots, episodes=total.robots - robots)
 
 

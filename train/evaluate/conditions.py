@@ -207,13 +207,14 @@ class Condition(Model):
         needed = sensors_needed(self.policy.name, self.environment.walks)
         # the environment refuses sensors of another type
         if needed and isinstance(sensors, list | tuple):
-            arguments["sensors"] = [*sensors, *(name for name in needed if name not in sensors)]
+            missing = [name for name in needed if name not in sensors]
+            arguments["sensors"] = [*sensors, *missing]
         return arguments
 
     @property
     def scenario_played(self) -> str | Scenario:
         """The scenario with its own ranges and varied fields; its name if it has neither."""
-        fields = {name: v for name, v in self.swept.items() if name.startswith(SCENARIO)}
+        fields = {k: v for k, v in self.swept.items() if k.startswith(SCENARIO)}
         if not fields and not self.ranges:
             return self.scenario
         scenario = make_scenario(self.scenario, self.environment.walks, self.ranges)
@@ -229,7 +230,7 @@ class Condition(Model):
     @property
     def policy_options(self) -> dict[str, Any]:
         """Options of the policy, with those that are swept."""
-        swept = {name: v for name, v in self.swept.items() if not name.startswith(SCENARIO)}
+        swept = {k: v for k, v in self.swept.items() if not k.startswith(SCENARIO)}
         return {**self.policy.options, **swept}
 
     @property

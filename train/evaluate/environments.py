@@ -233,7 +233,7 @@ class _Walker(Environment):
             further["num_steps"] = steps
         if isinstance(gait := parameters.get("gait"), dict):
             further |= gait
-        return " ".join([label, *(f"{name}={value}" for name, value in further.items())])
+        return " ".join([label, *(f"{k}={v}" for k, v in further.items())])
 
     def abscissa(self, reference: Reference) -> dict[str, float]:
         return {"step_period_s": float(f"{sum(map(float, _durations(reference))):.6g}")}
@@ -284,8 +284,8 @@ def _user_robot(name: str) -> Environment:
             f"{name} is no elastic_env.JointRobot but of type {type(robot).__name__}"
         )
     robot.register()
-    description = _DESCRIPTIONS["joints" if robot.end_effector is None else "end_effector"]
-    return replace(description, id=robot.id, robot=robot.name)
+    kind = "joints" if robot.end_effector is None else "end_effector"
+    return replace(_DESCRIPTIONS[kind], id=robot.id, robot=robot.name)
 
 
 def _read_descriptions() -> dict[str, Environment]:
@@ -311,5 +311,5 @@ def _read_descriptions() -> dict[str, Environment]:
 _USER_ROBOTS = ("joints", "end_effector")
 """Descriptions for robots of users, without and with an end effector."""
 _DESCRIPTIONS = _read_descriptions()
-ENVIRONMENTS = {name: e for name, e in _DESCRIPTIONS.items() if name not in _USER_ROBOTS}
+ENVIRONMENTS = {name: _DESCRIPTIONS[name] for name in IDS}
 """Environments of the package by their short names."""

@@ -110,7 +110,7 @@ def evaluate_together(
         num_threads: See `evaluate`.
     """
     results = [Evaluation(condition) for condition in conditions]
-    episodes = [(result, n) for result in results for n in range(result.condition.episodes)]
+    episodes = [(r, n) for r in results for n in range(r.condition.episodes)]
     num_worlds = 1 if conditions[0].environment.is_real else MOST_WORLDS
     for first in range(0, len(episodes), num_worlds):
         batch = episodes[first : first + num_worlds]
@@ -128,7 +128,7 @@ def _play(env: Any, episodes: Episodes, progress: Progress) -> None:
     if hasattr(policy, "rehearse"):
         with policy_errors(condition, 0):
             policy.rehearse(env, seeds[0])
-    first_episodes = {world: result for world, (result, n) in enumerate(episodes) if n == 0}
+    first_episodes = {w: result for w, (result, n) in enumerate(episodes) if n == 0}
     observers = Observers(env, policy, condition.environment, first_episodes)
     records: dict[int, dict[str, Any]] = {}
     reported = 0

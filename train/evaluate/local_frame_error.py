@@ -70,18 +70,18 @@ class SupportChanges:
         self._errors: list[Array] = []
         self._jumps: list[Array] = []
 
-    def record(self, step: int, q_estimate: Array, observation: Array, truth: Any) -> None:
+    def record(self, step: int, q: Array, observation: Array, truth: Any) -> None:
         """Record a control step.
 
         Args:
             step: Its number, 0 at the start of the episodes.
-            q_estimate: Joint angles that the policy estimates, (num_worlds, 12) [rad].
+            q: Joint angles that the policy estimates, (num_worlds, 12) [rad].
             observation: Observation of the policy, (num_worlds, m).
             truth: True state at that time, an `elastic_env.robots.thormang.records.WalkTruth`.
         """
         if step not in self._changes:
             return
-        estimate = local_frame(self._biped, q_estimate, observation[:, self._attitude])
+        estimate = local_frame(self._biped, q, observation[:, self._attitude])
         true = local_frame(self._biped, truth.q, tilt(truth.pelvis_R))
         old = int(self._support[step - 1])
         new = int(self._support[step])

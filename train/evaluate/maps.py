@@ -68,7 +68,7 @@ class Axis(Model):
         if self.is_motion:
             name = environment.motion
             motions = [environment.arguments(value)[name] for value in self.values]
-            numbers = [n for motion in motions for n in environment.abscissa(motion).values()]
+            numbers = [n for m in motions for n in environment.abscissa(m).values()]
             return [f"{n:g}" for n in numbers] or list(map(environment.label, motions))
         factor = _UNITS.get(scenario_fields()[self.what][1], ("", 1.0))[1]
         return [f"{factor * value:.4g}" for value in self.values]
@@ -189,7 +189,7 @@ class HeatMap:
 
     @property
     def wins(self) -> dict[str, int]:
-        """Number of cells in which each policy is the best, most first; policies with any alone."""
+        """Number of cells in which a policy is the best, most first; only policies with any."""
         wins = Counter(cell.best for cell in self.flat)
         ranked = sorted(self.table.policies, key=lambda title: -wins[title])
         return {title: wins[title] for title in ranked if wins[title]}
@@ -208,9 +208,9 @@ def heat_maps(evaluations: Sequence[Evaluation], config: MapConfig) -> list[Heat
     """
 
     def title_of(e: Evaluation) -> str:
-        condition = e.condition
-        motion = condition.environment.title(condition.reference_name)
-        return condition.scenario if config.motion else f"{motion}, {condition.scenario}"
+        c = e.condition
+        motion = c.environment.title(c.reference_name)
+        return c.scenario if config.motion else f"{motion}, {c.scenario}"
 
     return [
         heat_map
@@ -229,7 +229,7 @@ def _heat_maps(title: str, table: EpisodeTable, config: MapConfig) -> list[HeatM
     rows = [[cells[y, x] for x in across] for y in range(len(config.y.values))]
     maps = []
     for column in table.environment.judged:
-        map_cells = [[_map_cell(table, number, column) for number in row] for row in rows]
+        map_cells = [[_map_cell(table, cell, column) for cell in row] for row in rows]
         maps.append(HeatMap(title, column, config, table, map_cells))
     return maps
 

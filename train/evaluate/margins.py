@@ -111,7 +111,7 @@ def failure_causes(
         progress: Called with the number of every control step, which all worlds make together.
     """
     if len(conditions) > 1 and not can_share_worlds(conditions[0]):
-        causes = [failure_causes([single], num_threads, progress) for single in conditions]
+        causes = [failure_causes([c], num_threads, progress) for c in conditions]
         return np.concatenate(causes)
     seeds = [condition.seed for condition in conditions]
     with closing(make_shared_env(conditions, num_threads, AutoresetMode.DISABLED)) as env:
@@ -171,13 +171,12 @@ def find_margins(
         halvings: See `bisect`.
         play: Returns the causes of failure of conditions, see `failure_causes`.
     """
+    fields = [f"{SCENARIO}{quantity.field}" for quantity in quantities]
 
     def play_values(values: Array) -> Causes:
         conditions = [
-            condition.replace(
-                swept={f"{SCENARIO}{quantity.field}": float(value)}, seed=condition.seed + robot
-            )
-            for quantity, row in zip(quantities, values, strict=True)
+            condition.replace(swept={field: float(value)}, seed=condition.seed + robot)
+            for field, row in zip(fields, values, strict=True)
             for robot, value in enumerate(row)
         ]
         return play(conditions).reshape(values.shape)
@@ -187,8 +186,8 @@ def find_margins(
     edges = bisect(play_values, first, last, halvings)
     distance = np.abs(edges.survived - first)
     worst = distance.argmin(axis=1)
-    checked = first + CHECKED_SHARE * np.sign(last - first) * distance.min(axis=1, keepdims=True)
-    failed = play_values(checked) != ""
+    least = distance.min(axis=1, keepdims=True)
+    failed = play_values(first + CHECKED_SHARE * np.sign(last - first) * least) != ""
     records = []
     for row, quantity in enumerate(quantities):
         fails_at = edges.failed[row, worst[row]]

@@ -5,8 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from baselines.identification.identify import StaticPoints
-from baselines.identification.static_points import HoldRecorder
+from baselines.identification.static_points import HoldRecorder, StaticPoints
 from elastic_env.core.signals import Array, BoolArray
 from elastic_env.world.robot_model import WalkerModel
 from train.evaluate.environments import Environment
@@ -20,14 +19,14 @@ class Observers:
         env: Vector environment.
         policy: Policy that plays in it.
         environment: Its description.
-        traced_worlds: Worlds whose first episode is traced.
+        traced: Worlds whose first episode is traced.
 
     Attributes:
         traces: Traces by world.
     """
 
     def __init__(
-        self, env: Any, policy: Any, environment: Environment, traced_worlds: Iterable[int]
+        self, env: Any, policy: Any, environment: Environment, traced: Iterable[int]
     ) -> None:
         task = env.unwrapped.task
         model = task.assumed_model
@@ -39,7 +38,7 @@ class Observers:
         self._estimate = _Rms(env.num_envs) if has_estimate else None
         self._changes = SupportChanges(model) if has_estimate and walks else None
         self._imu = _Rms(env.num_envs) if walks else None
-        self.traces = {world: Trace(task, environment.traced, world) for world in traced_worlds}
+        self.traces = {w: Trace(task, environment.traced, w) for w in traced}
         self._ended = set[int]()
         self._scored = np.zeros(env.num_envs, dtype=np.bool_)
 
@@ -51,7 +50,8 @@ class Observers:
             if world not in self._ended:
                 trace.record(observation, {**info, "scored": scored})
         if self._imu is not None:
-            attitude = observation[:, self._task.observation_table.group("imu_attitude")]
+            columns = self._task.observation_table.group("imu_attitude")
+            attitude = observation[:, columns]
             truth = np.stack([info["pelvis_roll"], info["pelvis_pitch"]], axis=1)
             self._imu.add(np.square(attitude - truth).sum(axis=1), scored)
         if self._estimate is not None:

@@ -47,8 +47,8 @@ def find_members(pattern: str) -> list[ResidualFolder]:
     """
     if not _WILDCARD.search(pattern):
         return [ResidualFolder(Path(pattern), read_description(Path(pattern)))]
-    folders = _matching_folders(pattern) or map(Path, fnmatch.filter(shipped_names(), pattern))
-    folders = sorted(folders, key=_natural_order)
+    shipped = map(Path, fnmatch.filter(shipped_names(), pattern))
+    folders = sorted(_matching_folders(pattern) or shipped, key=_natural_order)
     members = [ResidualFolder(folder, read_description(folder)) for folder in folders]
     if not members:
         choices = _similar_folders(Path(pattern))
@@ -124,7 +124,7 @@ def _require_one_family(pattern: str, members: Sequence[ResidualFolder]) -> None
 def _family_settings(description: ResidualDescription) -> dict[str, object]:
     """Settings that the members of a family share."""
     config = description.training.get("config", {})
-    trained = {f"the trained {key}": config[key] for key in config if key not in _SEED_KEYS}
+    trained = {f"the trained {k}": v for k, v in config.items() if k not in _SEED_KEYS}
     names = ("robot", "base", "base_options", "settings")
     return trained | {name: getattr(description, name) for name in names}
 

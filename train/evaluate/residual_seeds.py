@@ -138,14 +138,14 @@ def _require_motion(member: ResidualFolder) -> None:
 
 
 def _opponents(
-    description: ResidualDescription, residual: PolicySpec, policies: Sequence[PolicySpec]
+    description: ResidualDescription, residual: PolicySpec, policies: list[PolicySpec]
 ) -> tuple[PolicySpec, PolicySpec | None]:
     """Base and rival of a residual, among the policies that play or new ones.
 
     The base has the same options. The rival is the best policy without learning that has the same
     sensors; None if that is the base. A rival among the policies counts if it assumes the same
-    stiffness, whatever its other options. If the base is the best policy with options, the residual
-    is compared with that policy without options if it plays.
+    stiffness; its other options do not count. If the base is the best policy with options, the
+    residual is compared with that policy without options if it plays.
 
     Args:
         description: Description of the residual.
@@ -167,8 +167,10 @@ def _opponents(
         changes = {"name": name, "label": label, "options": options, "track": None}
         return residual.replace(**changes)
 
-    same = [p for p in policies_named(description.base) if _without_none(p.options) == options]
-    base = same[0] if same else new_policy(description.base, f"base of {residual.title}", options)
+    bases = policies_named(description.base)
+    same = [p for p in bases if _without_none(p.options) == options]
+    role = f"base of {residual.title}"
+    base = same[0] if same else new_policy(description.base, role, options)
     policies = [*policies, base]
     environment = ENVIRONMENTS.get(description.robot)
     best = best_analytic(environment is not None and environment.walks)

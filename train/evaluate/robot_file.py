@@ -67,4 +67,5 @@ def files_of_robot(name: str) -> Iterator[Path]:
 
 def _file_arguments(arguments: Mapping[str, Any]) -> list[tuple[str, str]]:
     """Arguments that name a file, with its path."""
-    return [(n, arguments[n]) for n in ("model", "joints") if isinstance(arguments[n], str)]
+    values = [(name, arguments[name]) for name in ("model", "joints")]
+    return [(name, value) for name, value in values if isinstance(value, str)]

@@ -62,6 +62,11 @@ def robot_scores(evaluations: Sequence[Evaluation]) -> list[RobotScores]:
                 continue
             failed, episodes = failures(rows)
             for column in table.environment.judged:
+                better = {
+                    title: share_better(rows, table.rows_of(title, cell), column.metric)
+                    for title in others
+                    if (title, cell) in table.conditions
+                }
                 scores = RobotScores(
                     **vars(scope),
                     column=column,
@@ -70,11 +75,7 @@ def robot_scores(evaluations: Sequence[Evaluation]) -> list[RobotScores]:
                     worst=score(rows, column, mean_of_part(worst_share)),
                     failed=failed,
                     episodes=episodes,
-                    better={
-                        title: share_better(rows, table.rows_of(title, cell), column.metric)
-                        for title in others
-                        if (title, cell) in table.conditions
-                    },
+                    better=better,
                 )
                 result.append(scores)
     return result

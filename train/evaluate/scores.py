@@ -1,6 +1,6 @@
 """Scores of policies from rows of the episode table: means over robots and cells, pairs, ranks."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 import numpy as np
@@ -12,6 +12,7 @@ from train.evaluate.episodes import Evaluation, group_by
 from train.evaluate.statistics import (
     Counts,
     Estimate,
+    Mean,
     beats,
     estimate,
     mean_of_part,
@@ -82,24 +83,18 @@ def episodes_as_robots(rows: pd.DataFrame) -> pd.DataFrame:
     return rows.assign(robot=rows["robot"].where(~is_alone, rows["seed"].astype(str)))
 
 
-def score(
-    rows: pd.DataFrame,
-    column: Column,
-    mean: Callable[[Array, Array], Array] = mean_of_robots,
-) -> Estimate:
+def score(rows: pd.DataFrame, column: Column, mean: Mean = mean_of_robots) -> Estimate:
     """Mean over cells of a metric of one policy [SI]; over training seeds the interquartile mean.
 
     Args:
         rows: Rows of one policy in one or several cells.
         column: The metric.
-        mean: Mean over the robots of a cell that have a value, as `mean_of_robots`.
+        mean: Mean over the robots of a cell that have a value.
     """
     return over_cells(per_robot(rows, column.metric), mean)
 
 
-def over_cells(
-    values: Sequence[Array], mean: Callable[[Array, Array], Array] = mean_of_robots
-) -> Estimate:
+def over_cells(values: Sequence[Array], mean: Mean = mean_of_robots) -> Estimate:
     """Mean over cells of means over robots, with its interval.
 
     Args:
@@ -118,23 +113,20 @@ def median_of(evaluation: Evaluation, metric: str) -> Estimate:
 
     The interval is over seeds and episodes. There is none if all episodes are the same.
     """
-    condition = evaluation.condition
-    is_one = condition.environment.is_deterministic(condition.scenario, condition.reference)
+    c = evaluation.condition
+    count = 1 if c.environment.is_deterministic(c.scenario, c.reference) else None
     seeds = group_by(evaluation.episodes, lambda episode: episode.get("training_seed"))
     values = [
-        [None if e["termination"] else e.get(metric) for e in episodes[: 1 if is_one else None]]
+        [None if e["termination"] else e.get(metric) for e in episodes[:count]]
         for episodes in seeds.values()
     ]
     return over_cells([np.array(values, dtype=np.float64)], mean_of_part(middle))
 
 
-def means_of_cells(
-    values: Sequence[Array],
-    counts: Counts,
-    mean: Callable[[Array, Array], Array] = mean_of_robots,
-) -> Array:
+def means_of_cells(values: Sequence[Array], counts: Counts, mean: Mean = mean_of_robots) -> Array:
     """Means over the robots of every cell, (cells, resamples, seeds)."""
-    return np.array([mean(cell, count) for cell, count in zip(values, counts, strict=True)])
+    cells = zip(values, counts, strict=True)
+    return np.array([mean(cell, count) for cell, count in cells])
 
 
 def pair(mine: pd.DataFrame, base: pd.DataFrame, metric: str) -> pd.DataFrame:

@@ -28,7 +28,7 @@ MOST_DRAWS = 10**7
 """Largest number of units that all resamples draw; it bounds the resamples of many episodes."""
 WORST = 0.1
 """Share of the robots that count as the worst ones."""
-_TRIMMED_SHARE = 0.25
+_TRIM_SHARE = 0.25
 _BOOTSTRAP_SEED = 0
 
 Counts: TypeAlias = Sequence[Array]
@@ -62,7 +62,7 @@ class Estimate:
     def over(self) -> str:
         """Units of the interval: "10 training seeds and 64 robots"; empty without one."""
         units = {"training seeds": self.seeds, "robots": self.robots, "episodes": self.episodes}
-        return " and ".join(f"{number} {unit}" for unit, number in units.items() if number)
+        return " and ".join(f"{n} {unit}" for unit, n in units.items() if n)
 
     @property
     def is_known(self) -> bool:
@@ -84,7 +84,8 @@ class Estimate:
 
     def times(self, factor: float) -> "Estimate":
         """Return the estimate in another unit; the factor is positive."""
-        low, high = (None if end is None else factor * end for end in (self.low, self.high))
+        bounds = (self.low, self.high)
+        low, high = (None if end is None else factor * end for end in bounds)
         return replace(self, value=factor * self.value, low=low, high=high)
 
 
@@ -111,7 +112,7 @@ def interquartile_mean(values: Array, axis: int = -1) -> Any:
 
     # with any nan, SciPy would loop over the rows
     is_unknown = np.isnan(values).any(axis=axis, keepdims=True)
-    trimmed = stats.trim_mean(np.where(is_unknown, 0.0, values), _TRIMMED_SHARE, axis=axis)
+    trimmed = stats.trim_mean(np.where(is_unknown, 0.0, values), _TRIM_SHARE, axis=axis)
     return np.where(np.squeeze(is_unknown, axis=axis), np.nan, trimmed)[()]
 
 
@@ -160,13 +161,15 @@ def mean_of_robots(values: Array, counts: Array) -> Array:
     return total / np.where(number > 0.0, number, np.nan)
 
 
+Mean: TypeAlias = Callable[[Array, Array], Array]
+"""Mean over robots in resamples, from values and counts, as `mean_of_robots`."""
 Part: TypeAlias = Callable[[Array], tuple[Array, Array]]
 """Number of values below the part that counts, and up to its end, in a sorted sample of n."""
 
 
 def middle_half(n: Array) -> tuple[Array, Array]:
     """The part of `interquartile_mean`."""
-    trimmed = np.floor(_TRIMMED_SHARE * n)
+    trimmed = np.floor(_TRIM_SHARE * n)
     return trimmed, n - trimmed
 
 
@@ -187,8 +190,8 @@ def middle(n: Array) -> tuple[Array, Array]:
     return (n - 1.0) / 2.0, (n + 1.0) / 2.0
 
 
-def mean_of_part(part: Part) -> Callable[[Array, Array], Array]:
-    """Return a function as `mean_of_robots` for the mean over a part of the sorted robots."""
+def mean_of_part(part: Part) -> Mean:
+    """Return the mean over a part of the robots, which are sorted by their values."""
 
     def mean(values: Array, counts: Array) -> Array:
         return np.stack([_mean_of_part(seed, counts, part) for seed in values], axis=-1)
@@ -199,10 +202,9 @@ def mean_of_part(part: Part) -> Callable[[Array, Array], Array]:
 def _mean_of_part(values: Array, counts: Array, part: Part) -> Array:
     """Means of one seed, (robots,) to (resamples,)."""
     known = np.sort(values[np.isfinite(values)])
-    order = np.argsort(values)[: len(known)]
     if not len(known):
         return np.full(len(counts), np.nan)
-    sorted_counts = counts[:, order]
+    sorted_counts = counts[:, np.argsort(values)[: len(known)]]
     ends = sorted_counts.cumsum(axis=1)
     low, high = part(ends[:, -1:])
     weights = np.minimum(ends, high) - np.maximum(ends - sorted_counts, low)

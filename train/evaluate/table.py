@@ -175,10 +175,10 @@ class EpisodeTable:
             yield self.scope(policy, cell)
             block = blocks[motion(cell)]
             if cell == block[-1]:
-                cells_by_scenario = {self.conditions[policy, n].scenario: n for n in block}
+                by_scenario = {self.conditions[policy, n].scenario: n for n in block}
                 for name, scenarios in groups.items():
-                    if cells_by_scenario.keys() >= set(scenarios):
-                        members = [cells_by_scenario[scenario] for scenario in scenarios]
+                    if by_scenario.keys() >= set(scenarios):
+                        members = [by_scenario[scenario] for scenario in scenarios]
                         yield self.scope(policy, *members, group=name)
 
     def cells_of_base(self, scope: Scope, base: str) -> list[int]:
@@ -206,5 +206,5 @@ class EpisodeTable:
 
 def _robot_name(episode: Mapping[str, Any]) -> str:
     """Name of the robot of an episode: its recorded parameters, or else its seed."""
-    figures = [(name, value) for name, value in episode.items() if name.startswith("robot_")]
+    figures = [item for item in episode.items() if item[0].startswith("robot_")]
     return str(figures or episode["seed"])

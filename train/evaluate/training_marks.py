@@ -15,7 +15,7 @@ def training_marks(origin: Origin | None, conditions: Sequence[Condition]) -> tu
 
     Args:
         origin: Training of the residual; None for a baseline, which has no marks.
-        conditions: Of the row, which share motion and swept values.
+        conditions: Conditions of the row; all have the same motion and swept values.
     """
     if origin is None:
         return ()
@@ -26,16 +26,16 @@ def training_marks(origin: Origin | None, conditions: Sequence[Condition]) -> tu
     if motion is None:
         motion = environment.default_reference
     played_motion = _motion_label(environment, conditions[0].reference)
-    motion_is_known = _motion_label(environment, motion) == played_motion
+    is_same = _motion_label(environment, motion) == played_motion
     quantity = environment.quantity or "reference"
     scenarios = [_training_name(condition, origin) for condition in conditions]
     unseen = [scenario for scenario in scenarios if scenario not in origin.scenarios]
     if unseen:
         if len(unseen) == len(scenarios):
-            return (HELD_OUT if motion_is_known else f"{HELD_OUT} scenario and {quantity}",)
+            return (HELD_OUT if is_same else f"{HELD_OUT} scenario and {quantity}",)
         names = f": {', '.join(unseen)}"
-        return (f"{PARTLY}{names}" if motion_is_known else f"{HELD_OUT}{names} and {quantity}",)
-    if not motion_is_known:
+        return (f"{PARTLY}{names}" if is_same else f"{HELD_OUT}{names} and {quantity}",)
+    if not is_same:
         return (f"{HELD_OUT} {quantity}",)
     if conditions[0].swept:
         return ()
@@ -47,7 +47,7 @@ def training_marks(origin: Origin | None, conditions: Sequence[Condition]) -> tu
 
 
 def _training_name(condition: Condition, origin: Origin) -> str:
-    """Return the name under which training has seen the scenario of a condition."""
+    """Name under which training has seen a condition's scenario, else one that it has not seen."""
     played = condition.scenario_played
     trained_names = origin.scenarios or ()
     if isinstance(played, str) and not origin.ranges:
@@ -64,5 +64,5 @@ def _training_name(condition: Condition, origin: Origin) -> str:
 
 
 def _motion_label(environment: Environment, reference: Any) -> str:
-    """Label of the kind of a reference, or of its step period alone, whatever its other keys."""
+    """Label of the kind of a reference, or of its step period; other keys do not count."""
     return environment.label(environment.arguments(reference)[environment.motion])
