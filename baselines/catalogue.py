@@ -27,14 +27,14 @@ from baselines.compensation.measured import (
 )
 from baselines.compensation.oracle import Oracle, TrueSensors
 from baselines.compensation.policy import Policy, Zero
-from baselines.policy_options import PolicyOptions
+from baselines.policy_options import ASSUMED_OPTIONS, PolicyOptions
 from baselines.walking.controller import WalkingController, WalkingGains
 from baselines.walking.dcm_observer import DcmObserver
 from baselines.walking.foot_tare import FootTare
 from baselines.walking.foothold import FootholdCorrection
 from baselines.walking.phase_table import PhaseFeedforward, load_phase_table
 from baselines.walking.posture import PostureFeedback, PostureGains
-from baselines.walking.refined_walk import RefinedWalk, refine_model
+from baselines.walking.refined_plan import RefinedWalk, refine_model
 from baselines.walking.standing_estimate import StandingEstimate
 from baselines.walking.talos import HipTorque
 from baselines.walking.thormang import FootBalance, StanceRoll
@@ -67,7 +67,7 @@ TRACK_OF_SENSOR = {
 
 @dataclass(frozen=True)
 class NamedPolicy:
-    """A policy that `baselines.make` knows by name.
+    """A policy that `baselines.make` makes by name.
 
     Attributes:
         build: Builds it.
@@ -110,7 +110,7 @@ def _controller(env: Any, model: WalkerModel, options: PolicyOptions) -> Policy:
     return WalkingController(model, options.com_feedback, options.gains, options.ramp_s)
 
 
-def _disable_com_feedback(build: Builder) -> Builder:
+def _open_loop(build: Builder) -> Builder:
     """Builder of a policy without feedback of the center of mass."""
 
     def build_open(env: Any, model: RobotModel, options: PolicyOptions) -> Policy:
@@ -126,7 +126,7 @@ def _build_base(env: Any, model: WalkerModel, options: PolicyOptions) -> Any:
     return COMPENSATED[base](env, model, options)
 
 
-def _measure_weight(build: Builder) -> Builder:
+def _weigh_robot(build: Builder) -> Builder:
     """Builder of a policy whose controller measures the weight, unless `gains` set the filter."""
 
     def build_weighing(env: Any, model: WalkerModel, options: PolicyOptions) -> Any:
@@ -146,16 +146,17 @@ def _build_adaptive(env: Any, model: WalkerModel, options: PolicyOptions) -> Any
 def _add_posture_feedback(build: Builder) -> Builder:
     """Builder of a policy with posture feedback, and with a ZMP offset where options ask for it."""
 
-    def build_with_feedback(env: Any, model: WalkerModel, options: PolicyOptions) -> Any:
-        policy = PostureFeedback(build(env, model, options), model, options.posture, options.ramp_s)
+    def build_feedback(env: Any, model: WalkerModel, options: PolicyOptions) -> Any:
+        inner = build(env, model, options)
+        policy = PostureFeedback(inner, model, options.posture, options.ramp_s)
         if options.zmp_offset is None:
             return policy
         return ZmpOffset(policy, model, options.zmp_offset)
 
-    return build_with_feedback
+    return build_feedback
 
 
-_build_adaptive_posture = _measure_weight(_add_posture_feedback(_build_adaptive))
+_build_adaptive_posture = _weigh_robot(_add_posture_feedback(_build_adaptive))
 
 
 def _oracle(env: Any, model: RobotModel, options: PolicyOptions) -> Policy:
@@ -263,7 +264,8 @@ def _build_iterative(env: Any, model: RobotModel, options: PolicyOptions) -> Any
     if "swing_s" not in options.posture.model_fields_set:
         given = options.posture.model_dump(exclude_unset=True)
         options = options.replace(posture=PostureGains(**given, swing_s=0.0))
-    base = policies_of(is_walker)[learned_base(options, is_walker)].build(env, model, options)
+    named = policies_of(is_walker)[learned_base(options, is_walker)]
+    base = named.build(env, model, options)
     signals = learned_signals(model, options.learning)
     learner = IterativeLearner(base, model, signals, options.ramp_s)
     learner.trials = options.learning.trials
@@ -283,9 +285,10 @@ def _sensor_policy(
         compensator = MeasuredCompensator(model, sensors, output, options.gravity)
         inner = core(env, model, options)
         policy = Compensated(inner, compensator, options.ramp_s, corrects_policy=True)
-        return OnlineStiffness(policy, model, make_estimator(model, sensors), options.adaptation)
+        estimator = make_estimator(model, sensors)
+        return OnlineStiffness(policy, model, estimator, options.adaptation)
 
-    return NamedPolicy(_measure_weight(build), options, TRACK_OF_SENSOR[sensor], (sensor,))
+    return NamedPolicy(_weigh_robot(build), options, TRACK_OF_SENSOR[sensor], (sensor,))
 
 
 def _thormang(env: Any, model: WalkerModel, options: PolicyOptions) -> Policy:  # noqa: ARG001
@@ -304,14 +307,14 @@ COMPENSATED: Mapping[str, Builder] = {
     "dynamic": _compensate(_controller, DynamicCompensator, "wrench"),
 }
 """Compensated policies of a walker, on which a feedback can build."""
-ASSUMED_OPTIONS = ("stiffness", "stiffness_scale")
-"""Options for the assumed stiffness of the joints."""
 _COMPENSATOR_OPTIONS = (*ASSUMED_OPTIONS, "output", "gravity", "ramp_s")
 _CONTROLLER_OPTIONS = ("gains", "com_feedback", "ramp_s")
 _COMPENSATED_OPTIONS = (*_COMPENSATOR_OPTIONS, "gains", "com_feedback")
 _ADAPTIVE_OPTIONS = (*_COMPENSATED_OPTIONS, "base", "adaptation")
 _POSTURE_OPTIONS = ("posture", "zmp_offset")
-_FOOTHOLD_OPTIONS = ("foothold", "standing", "foot_tare")
+_ADAPTIVE_POSTURE_OPTIONS = (*_ADAPTIVE_OPTIONS, *_POSTURE_OPTIONS)
+_FOOTHOLD_OPTIONS = (*_ADAPTIVE_POSTURE_OPTIONS, "foothold", "standing", "foot_tare")
+_SENSOR_OPTIONS = (*_COMPENSATED_OPTIONS, "adaptation")
 _LEARNING_OPTIONS = ("learned_base", "learning")
 _THORMANG_OPTIONS = ("stance_roll", "foot_balance", "ramp_s")
 _TALOS_OPTIONS = (*ASSUMED_OPTIONS, *_CONTROLLER_OPTIONS, "hip_torque")
@@ -322,10 +325,7 @@ ON_JOINTS: Mapping[str, NamedPolicy] = {
     "dynamic": NamedPolicy(_compensate(_zero, DynamicCompensator), _COMPENSATOR_OPTIONS),
     "friction": NamedPolicy(_friction, _COMPENSATOR_OPTIONS),
     "disturbance_observer": NamedPolicy(
-        _joint_observer,
-        (*_COMPENSATOR_OPTIONS, "observer"),
-        TRACK_OF_SENSOR[LINK_IMU],
-        (LINK_IMU,),
+        _joint_observer, (*_COMPENSATOR_OPTIONS, "observer"), TRACK_OF_SENSOR[LINK_IMU], (LINK_IMU,)
     ),
     "link_encoder": _sensor_policy(LINK_ENCODER, (*_COMPENSATOR_OPTIONS, "adaptation")),
     "iterative": NamedPolicy(
@@ -340,42 +340,31 @@ There is no controller, so that `uncompensated` equals `zero`.
 ON_THE_WALKER: Mapping[str, NamedPolicy] = {
     "zero": NamedPolicy(_zero),
     "uncompensated_open": NamedPolicy(
-        _disable_com_feedback(_controller), (*ASSUMED_OPTIONS, "gains", "ramp_s")
+        _open_loop(_controller), (*ASSUMED_OPTIONS, "gains", "ramp_s")
     ),
     "uncompensated": NamedPolicy(_controller, (*ASSUMED_OPTIONS, *_CONTROLLER_OPTIONS)),
-    "input_open": NamedPolicy(
-        _disable_com_feedback(COMPENSATED["input"]), (*_COMPENSATOR_OPTIONS, "gains")
-    ),
+    "input_open": NamedPolicy(_open_loop(COMPENSATED["input"]), (*_COMPENSATOR_OPTIONS, "gains")),
     **{name: NamedPolicy(build, _COMPENSATED_OPTIONS) for name, build in COMPENSATED.items()},
-    "adaptive": NamedPolicy(_measure_weight(_build_adaptive), _ADAPTIVE_OPTIONS),
+    "adaptive": NamedPolicy(_weigh_robot(_build_adaptive), _ADAPTIVE_OPTIONS),
     "posture": NamedPolicy(
         _add_posture_feedback(_build_base), (*_COMPENSATED_OPTIONS, "base", *_POSTURE_OPTIONS)
     ),
-    "adaptive_posture": NamedPolicy(
-        _build_adaptive_posture, (*_ADAPTIVE_OPTIONS, *_POSTURE_OPTIONS)
-    ),
-    "foothold": NamedPolicy(_foothold, (*_ADAPTIVE_OPTIONS, *_POSTURE_OPTIONS, *_FOOTHOLD_OPTIONS)),
+    "adaptive_posture": NamedPolicy(_build_adaptive_posture, _ADAPTIVE_POSTURE_OPTIONS),
+    "foothold": NamedPolicy(_foothold, _FOOTHOLD_OPTIONS),
     "disturbance_observer": NamedPolicy(
-        _dcm_observer,
-        (*_ADAPTIVE_OPTIONS, "posture", "foothold", "foot_tare", "dcm_observer"),
+        _dcm_observer, (*_ADAPTIVE_OPTIONS, "posture", "foothold", "foot_tare", "dcm_observer")
     ),
-    "phase_table": NamedPolicy(
-        _phase_table,
-        (*_ADAPTIVE_OPTIONS, *_POSTURE_OPTIONS, *_FOOTHOLD_OPTIONS, "phase_table"),
-        Track.TRAINING,
-    ),
-    "torque_sensor": _sensor_policy(TORQUE_SENSOR, (*_COMPENSATED_OPTIONS, "adaptation")),
-    "hip_sensor": _sensor_policy(LINK_ENCODER, (*_COMPENSATED_OPTIONS, "adaptation"), ("hip",)),
-    "link_encoder": _sensor_policy(LINK_ENCODER, (*_COMPENSATED_OPTIONS, "adaptation")),
+    "phase_table": NamedPolicy(_phase_table, (*_FOOTHOLD_OPTIONS, "phase_table"), Track.TRAINING),
+    "torque_sensor": _sensor_policy(TORQUE_SENSOR, _SENSOR_OPTIONS),
+    "hip_sensor": _sensor_policy(LINK_ENCODER, _SENSOR_OPTIONS, ("hip",)),
+    "link_encoder": _sensor_policy(LINK_ENCODER, _SENSOR_OPTIONS),
     "thormang": NamedPolicy(_thormang, _THORMANG_OPTIONS),
     "talos": NamedPolicy(_talos, _TALOS_OPTIONS, Track.TORQUE_SENSORS, (TORQUE_SENSOR,)),
     "iterative": NamedPolicy(
         _build_iterative, (*_ADAPTIVE_OPTIONS, "posture", *_LEARNING_OPTIONS), Track.WALKS
     ),
     "oracle": NamedPolicy(
-        _oracle,
-        (*_CONTROLLER_OPTIONS, *_POSTURE_OPTIONS, "foothold", "standing"),
-        Track.TRUTH,
+        _oracle, (*_CONTROLLER_OPTIONS, *_POSTURE_OPTIONS, "foothold", "standing"), Track.TRUTH
     ),
 }
 """Policies of the walker.

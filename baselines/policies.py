@@ -6,17 +6,9 @@ from typing import Any
 from baselines.adaptation.iterative import LearnedOffsets
 from baselines.adaptation.learned_signals import learned_signals
 from baselines.adaptation.offset_folder import load_table
-from baselines.catalogue import (
-    ASSUMED_OPTIONS,
-    BEST_ON_JOINTS,
-    BEST_ON_THE_WALKER,
-    ON_JOINTS,
-    ON_THE_WALKER,
-    Track,
-    policies_of,
-)
+from baselines.catalogue import BEST_ON_JOINTS, BEST_ON_THE_WALKER, Track, policies_of
 from baselines.compensation.policy import Policy
-from baselines.policy_options import PolicyOptions
+from baselines.policy_options import ASSUMED_OPTIONS, PolicyOptions
 from baselines.residual.correction import Corrected
 from baselines.residual.residual_folder import load_residual
 from baselines.residual.residual_policy import ResidualPolicy
@@ -36,7 +28,7 @@ def is_saved(name: str) -> bool:
 
 def policy_names() -> list[str]:
     """Names that `make` accepts."""
-    return list({**ON_THE_WALKER, **ON_JOINTS})
+    return list({**policies_of(is_walker=True), **policies_of(is_walker=False)})
 
 
 def track(name: str, is_walker: bool = True) -> Track:
@@ -72,7 +64,7 @@ def make(name: str, env: Any, /, **options: Any) -> Policy:
     | `input_wrench` | – | the estimate uses the measured foot wrenches, not the planned share |
     | `dynamic` | full joint torque with D; servo with B inverted | the same, links as `input_wrench` |
     | `friction` | `dynamic`, and the model's Coulomb friction fed forward | – |
-    | `disturbance_observer` | `friction`, and the torque that the model lacks by the link's IMU | `foothold`, mean ZMP error by a DCM observer |
+    | `disturbance_observer` | `friction`, and the torque that the model lacks, by the link's IMU | `foothold`, mean ZMP error by a DCM observer |
     | `adaptive` | – | `input_output`, stiffness of each leg and weight estimated online |
     | `posture` | – | `input_output` with the pelvis' attitude fed back to the hips |
     | `adaptive_posture` | – | both |
@@ -143,7 +135,8 @@ def _residual_policy(folder: Path, env: Any, options: dict[str, Any]) -> Policy:
         has = f"the environment's has {', '.join(joints)}"
         raise ConfigurationError(f"{shorten(folder)} was trained on {trained}; {has}")
     base = make(description.base, env, **{**description.base_options, **options})
-    return ResidualPolicy(Corrected(base, model, description.settings, truth_of(env)), network)
+    corrected = Corrected(base, model, description.settings, truth_of(env))
+    return ResidualPolicy(corrected, network)
 
 
 def _learned_policy(folder: Path, env: Any, options: dict[str, Any]) -> Policy:
@@ -159,8 +152,7 @@ def _learned_policy(folder: Path, env: Any, options: dict[str, Any]) -> Policy:
 
 def _require_effect(name: str, env: Any, given: Any, usable: tuple[str, ...]) -> None:
     """Refuse options without effect on a policy."""
-    listed = ", ".join(usable)
-    takes = f"its options are: {listed}" if usable else "it has no options"
+    takes = f"its options are: {', '.join(usable)}" if usable else "it has no options"
     for option in given:
         if option not in usable:
             # of the policies with options only the oracle assumes no stiffness

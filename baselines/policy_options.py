@@ -20,6 +20,9 @@ from baselines.walking.zmp_offset import ZmpOffsetGains
 from elastic_env.core.config import Model, quantity
 from elastic_env.motion.trajectory import STAND_S
 
+ASSUMED_OPTIONS = ("stiffness", "stiffness_scale")
+"""Options for the assumed stiffness of the joints."""
+
 
 class PolicyOptions(Model):
     """Options of the named policies, as keyword arguments of `baselines.make`."""

@@ -51,7 +51,7 @@ class _DecisionLoop:
         self.corrected = Corrected(policy, model, self.settings, truth_of(env))
         self.features = Features(self.corrected)
         self._critic = CriticView(critic_sees, self.corrected) if critic_sees else None
-        width = self.features.width + (0 if self._critic is None else self._critic.width)
+        width = self.features.width + (self._critic.width if self._critic else 0)
         self.observation_space = Box(-np.inf, np.inf, (width,), np.float64)
         self.action_space = Box(-1.0, 1.0, (self.corrected.num_residuals,), np.float32)
         # worlds whose episode begins: for the policy, and for the features
@@ -68,7 +68,8 @@ class _DecisionLoop:
 
     def observe(self, rows: Array, worlds: BoolArray | None = None) -> Array:
         """Features of the coming decision; only some worlds remember the measurements, or all."""
-        features, past = self.features.at(rows, self._past, self._is_new, self._state, self._start)
+        policy = (self._state, self._start)
+        features, past = self.features.at(rows, self._past, self._is_new, *policy)
         if worlds is not None and self._past is not None:
             past = put_rows(self._past, worlds, select_rows(past, worlds))
         self._past = past
@@ -79,7 +80,8 @@ class _DecisionLoop:
 
     def act(self, observation: Array, residual: Array) -> npt.NDArray[np.float32]:
         """Commands of the corrected base for a control step."""
-        action, self._state = self.corrected.act(observation, residual, self._state, self._start)
+        policy = (self._state, self._start)
+        action, self._state = self.corrected.act(observation, residual, *policy)
         self._start = np.zeros_like(self._start)
         return action
 
@@ -131,7 +133,8 @@ class ResidualWrapper(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorAr
         """One decision."""
         if not self._last.size:
             raise gymnasium.error.ResetNeeded("reset() comes before the first step()")
-        residual = self._loop.read_residual(self._last[None], action, self.action_space)[None]
+        rows = self._last[None]
+        residual = self._loop.read_residual(rows, action, self.action_space)[None]
         total = 0.0
         terminated = False
         truncated = False
@@ -171,14 +174,14 @@ class ResidualVectorWrapper(gymnasium.vector.VectorWrapper[Any, Any, Any]):
         **settings: Any,
     ) -> None:
         super().__init__(env)
-        self._loop = _DecisionLoop(env, base_policy, settings, env.num_envs, critic_sees)
+        n = env.num_envs
+        self._loop = _DecisionLoop(env, base_policy, settings, n, critic_sees)
         self.actor_features = self._loop.features.width
         """Number of features of the residual, which are the first columns of the observation."""
         inner: Any = env.unwrapped
         self.autoreset_mode = autoreset_mode or inner.autoreset_mode
         self.settings = self._loop.settings
         """Settings of the residual."""
-        n = env.num_envs
         self.single_observation_space = self._loop.observation_space
         self.single_action_space = self._loop.action_space
         self.observation_space = batch_space(self.single_observation_space, n)
@@ -210,10 +213,11 @@ class ResidualVectorWrapper(gymnasium.vector.VectorWrapper[Any, Any, Any]):
         return self._last.copy(), info
 
     def stagger(self, generator: np.random.Generator) -> None:
-        """Cut the first episodes at decisions spread evenly over an episode, in random order.
+        """Cut the first episodes at decisions spread over the shortest episode, in random order.
 
-        Call it after `reset`. Then worlds are in different phases of an episode: without it
-        learning would see one phase at a time. A cut episode is truncated, and has no metrics.
+        Call it after `reset`. The cuts are evenly spaced. Then worlds are in different phases of an
+        episode: without it learning would see one phase at a time. A cut episode is truncated, and
+        has no metrics.
         """
         env: Any = self.env.unwrapped
         length = -(-env.task.fewest_control_steps // self.settings.decision_period)
@@ -245,7 +249,8 @@ class ResidualVectorWrapper(gymnasium.vector.VectorWrapper[Any, Any, Any]):
         self._rows, _ = self.env.reset(options={"reset_mask": worlds})
         self._done = self._done & ~worlds
         self._loop.begin(worlds)
-        return np.where(worlds[:, None], self._loop.observe(self._rows, worlds), features)
+        first = self._loop.observe(self._rows, worlds)
+        return np.where(worlds[:, None], first, features)
 
     def _decide(self, residual: Array, alive: BoolArray) -> Transition:
         """Hold a residual for a decision period in the worlds that are alive; observe features."""
@@ -285,7 +290,7 @@ class ResidualVectorWrapper(gymnasium.vector.VectorWrapper[Any, Any, Any]):
         return Transition(features, reward, terminated, truncated, info)
 
     def _step(self, command: Array) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        """Take a control step without autoreset; the mode of the environment does not change."""
+        """Take a control step without autoreset; afterwards the environment has its mode again."""
         env: Any = self.env.unwrapped
         mode = env.autoreset_mode
         env.autoreset_mode = AutoresetMode.DISABLED

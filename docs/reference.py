@@ -24,10 +24,10 @@ from baselines.policy_options import PolicyOptions
 from baselines.residual.settings import ResidualSettings
 from elastic_env import IDS
 from elastic_env.core.config import Model
-from elastic_env.core.robot_ranges import RobotRanges
 from elastic_env.core.signals import Signal
 from elastic_env.hardware.arm_settings import ArmSettings, ServoPlace
 from elastic_env.hardware.settings import SafetyLimits
+from elastic_env.world.robot_ranges import RobotRanges
 from elastic_env.world.scenario import DISTRIBUTIONS, RANGES_BEYOND, TRAINING_RANGES, scenario_names
 from train.commands.bench import BenchCase, BenchConfig
 from train.commands.cli import COMMANDS, main

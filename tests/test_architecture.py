@@ -1,10 +1,13 @@
 """An import of environments and policies loads no torch, and the wheel holds every part."""
 
+import ast
+import re
 import subprocess
 import sys
 import tomllib
 from pathlib import Path
 
+import pytest
 from setuptools import find_packages
 
 from tests.broken_formulas import BROKEN
@@ -61,3 +64,17 @@ def test_formulas_that_are_broken_on_purpose_stand_once() -> None:
     """Catches a formula that was rewritten, so that nobody breaks it any more."""
     counts = {one.right: (ROOT / one.file).read_text().count(one.right) for one in BROKEN}
     assert {text: count for text, count in counts.items() if count != 1} == {}
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_docstrings_begin_with_a_verb_or_the_thing(package: str) -> None:
+    """Catches a docstring that begins in the middle of a sentence, or only points elsewhere."""
+    halves = re.compile(r"(What|Whether|Where|Which|Who|How|When|Of|That|Those|It|See|Such)\b")
+    kinds = (ast.Module, ast.ClassDef, ast.FunctionDef)
+    bad = [
+        f"{file.relative_to(ROOT)}: {text}"
+        for file in sorted((ROOT / package).rglob("*.py"))
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8")))
+        if isinstance(node, kinds) and halves.match(text := ast.get_docstring(node) or "")
+    ]
+    assert bad == []

@@ -14,7 +14,7 @@ from train.commands.bench import BenchConfig, find_config
 from train.commands.cli import main
 from train.evaluate.conditions import Condition
 from train.evaluate.episodes import evaluate
-from train.runs.annotations import annotation
+from train.runs.github_annotations import annotation
 
 ROOT = Path(__file__).parents[1]
 QUICK = {"kind": "sine", "duration_s": 0.5, "onset_s": 0.5, "amplitude": 0.1}
@@ -29,7 +29,7 @@ def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def written(**case: Any) -> Path:
-    """A find_config of one rollout."""
+    """A configuration of one rollout."""
     path = Path("bench.yaml")
     content = {
         "env": "testbed",
@@ -168,7 +168,7 @@ def test_wrong_inputs_are_annotations_too(
     with pytest.raises(SystemExit) as end:
         main(["bench", "none.yaml"])
     assert end.value.code == 2
-    assert "::error title=elastic::no find_config file at none.yaml" in capsys.readouterr().out
+    assert "::error title=elastic::no configuration file at none.yaml" in capsys.readouterr().out
 
 
 def test_an_annotation_is_one_command_whatever_it_says() -> None:

@@ -27,6 +27,7 @@ from tests.cells import METRIC, cell, describe, episode_rows, family, over_seeds
 from train.commands.cli import main
 from train.commands.compare_config import CompareConfig
 from train.commands.comparison import _distinct_conditions
+from train.evaluate.change_text import CEILING, SAME_ROBOT, percent_interval
 from train.evaluate.changes import Change, changes
 from train.evaluate.conditions import Condition, Member, PolicySpec
 from train.evaluate.episodes import Evaluation, evaluate, merge_seeds
@@ -41,7 +42,6 @@ from train.evaluate.statistics import (
     interquartile_mean,
 )
 from train.evaluate.table import EpisodeTable
-from train.evaluate.terms import CEILING, SAME_ROBOT, percent_interval
 from train.figures.comparison_figures import has_swept_references
 from train.report.change_tables import cells_table, changes_table, print_changes, write_statistics
 from train.report.page import Page

@@ -45,7 +45,7 @@ KERNELS = (
     "baselines.walking.foothold",
     "baselines.walking.posture",
     "baselines.walking.zmp_shift",
-    "baselines.estimation.bending",
+    "baselines.estimation.model_error",
     "baselines.residual.network",
     "baselines.identification.servo_replay",
 )

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from elastic_env.core.errors import ConfigurationError
-from elastic_env.core.robot_ranges import FOOT_ERRORS, RobotRanges, draw_robots
 from elastic_env.core.signals import Array
 from elastic_env.robots.testbed.environment import make as make_testbed
 from elastic_env.robots.thormang.config import robot_bank
 from elastic_env.robots.thormang.environment import make_vector as make_walk_vector
 from elastic_env.world.foot_sensors import cross_talk_matrix
+from elastic_env.world.robot_ranges import FOOT_ERRORS, RobotRanges, draw_robots
 from elastic_env.world.scenario import GROUNDS, TRAINING_RANGES, Scenario, make_scenario
 from train.evaluate.conditions import Condition, PolicySpec
 

@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 
 import baselines
 import elastic_env  # noqa: F401  registers the environments
-from baselines.estimation.bending import BendingObserver
 from baselines.estimation.ground_level import TILT_RAD, VELOCITY_M_PER_S, GroundLevel, GroundMemory
+from baselines.estimation.model_error import BendingObserver
 from elastic_env.core.signals import Array
 from tests.ground_contact import zero_moment_point
 

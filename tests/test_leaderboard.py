@@ -24,7 +24,7 @@ from train.commands.compare_config import CompareConfig, Sweep
 from train.evaluate.changes import changes
 from train.evaluate.conditions import Condition, PolicySpec
 from train.evaluate.episodes import Evaluation, evaluate
-from train.evaluate.standings import PairedChange, Standing, standings
+from train.evaluate.leaderboard_rows import PairedChange, Standing, standings
 from train.evaluate.statistics import Estimate
 from train.report.leaderboard import (
     claims_table,
@@ -481,7 +481,7 @@ def test_a_policy_of_ones_own_stands_beside_published_ones_that_do_not_play(
     assert "published rows and your own must have the same version and protocol" in more
     text = published.read_text()
     published.write_text(text.replace("mujoco 4", "mujoco 3"))
-    assert "there by elastic-env" in refused([*mine[:-1], "other"])
+    assert "got published elastic-env" in refused([*mine[:-1], "other"])
     Path("board.yaml").write_text("name: board\n")
     assert "leaderboard: true" in refused([*mine[:-1], "none"])
     assert len(played) == 2  # all of it was found before anything played

@@ -20,8 +20,9 @@ from train.commands.compare_config import CompareConfig
 from train.evaluate.changes import changes
 from train.evaluate.conditions import Condition, PolicySpec, scenario_fields, vary_scenario
 from train.evaluate.episodes import Evaluation
-from train.evaluate.maps import HeatMap, MapConfig, best_of, heat_maps
+from train.evaluate.maps import HeatMap, MapConfig, heat_maps
 from train.evaluate.rollout import make_vector_env
+from train.evaluate.scores import best_of
 from train.evaluate.statistics import Estimate
 from train.figures.comparison_figures import draw_maps
 from train.figures.map_plots import Square, blend, panels

@@ -12,7 +12,7 @@ from baselines.compensation.compensated import Compensated
 from baselines.compensation.dynamic_compensator import DynamicCompensator
 from baselines.compensation.policy import PolicyInputs, Zero
 from baselines.walking.controller import WalkingController
-from baselines.walking.refined_walk import RefinedWalk, refine_model
+from baselines.walking.refined_plan import RefinedWalk, refine_model
 from elastic_env.core.signals import Array
 from tests.played import play_to_the_end
 

@@ -12,8 +12,8 @@ import pytest
 import elastic_env  # noqa: F401  registers the environments
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array, Signals
+from elastic_env.rendering.deviation_picture import ENLARGEMENT, enlarge_deviation
 from elastic_env.rigid.leg_kinematics import rotation_x, rotation_y
-from elastic_env.robots.deviations import ENLARGEMENT, enlarge_deviation
 from elastic_env.robots.testbed.model import Pendulum
 from elastic_env.robots.testbed.picture import TestbedPicture
 from elastic_env.robots.thormang.config import WalkConfig

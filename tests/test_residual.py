@@ -24,7 +24,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 import baselines
 from baselines.compensation.inputs import input_signals
-from baselines.estimation.bending import BendingObserver
+from baselines.estimation.model_error import BendingObserver
 from baselines.residual.correction import Channels, Corrected
 from baselines.residual.features import Features
 from baselines.residual.network import Network

@@ -16,13 +16,6 @@ from stable_baselines3.common.env_checker import check_env as check_sb3_env
 
 from elastic_env.core.config_problems import ModelError
 from elastic_env.core.errors import ConfigurationError
-from elastic_env.core.robot_ranges import (
-    FOOT_ERRORS,
-    DrawnRobot,
-    RobotRanges,
-    draw_robots,
-    latin_hypercube,
-)
 from elastic_env.core.signals import Array
 from elastic_env.joint.elasticity import static_deflection
 from elastic_env.robots.thormang import config as walk_config
@@ -31,6 +24,13 @@ from elastic_env.robots.thormang.environment import configure_walk
 from elastic_env.robots.thormang.environment import make as make_walk
 from elastic_env.robots.thormang.environment import make_vector as make_walk_vector
 from elastic_env.robots.thormang.model import DRAWN_LOAD, add_load, elastic_spec
+from elastic_env.world.robot_ranges import (
+    FOOT_ERRORS,
+    DrawnRobot,
+    RobotRanges,
+    draw_robots,
+    latin_hypercube,
+)
 from elastic_env.world.scenario import RANGES_BEYOND, TRAINING_RANGES, Scenario, make_scenario
 from tests.three_joints import ARM
 

@@ -19,6 +19,7 @@ from elastic_env.robots.thormang.config import robot_bank
 from elastic_env.world.scenario import TRAINING_RANGES, make_scenario
 from tests.cells import METRIC, cell, episode_rows, family, records
 from train.commands.compare_config import CompareConfig
+from train.evaluate.change_text import HELD_OUT
 from train.evaluate.changes import changes
 from train.evaluate.conditions import Condition, PolicySpec
 from train.evaluate.episodes import evaluate
@@ -26,7 +27,6 @@ from train.evaluate.residual_seeds import Origin
 from train.evaluate.robots import robot_scores, share_better
 from train.evaluate.rollout import make_vector_env
 from train.evaluate.statistics import interquartile_mean, mean_of_part, worst_share
-from train.evaluate.terms import HELD_OUT
 from train.learn.train_config import TrainConfig, training_worlds
 from train.report.report_text import Results
 from train.report.score_tables import print_robots, robots_table, write_robots

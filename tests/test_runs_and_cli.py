@@ -810,7 +810,9 @@ def test_every_command_has_help_and_refuses_what_it_does_not_know(
     with pytest.raises(SystemExit) as caught:
         main([*command, "--help"])
     assert caught.value.code == 0
-    assert f"elastic {' '.join(command)}" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert f"elastic {' '.join(command)}" in printed
+    assert "{None}" not in printed
     assert refused([*command, "--no-such-option"], capsys)
 
 

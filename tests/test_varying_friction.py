@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from elastic_env.core.errors import ConfigurationError
-from elastic_env.core.robot_ranges import RobotRanges, draw_robot
 from elastic_env.core.signals import Array
 from elastic_env.joint.elasticity import ElasticJoint, Servo
 from elastic_env.joint.friction import passed_torque
@@ -22,6 +21,7 @@ from elastic_env.joint.motor import Motor, terminal_speed
 from elastic_env.joint.varying_friction import VaryingFriction
 from elastic_env.world.drawn_robot import set_joints
 from elastic_env.world.physics import ManyWorlds, SingleWorld, simulate
+from elastic_env.world.robot_ranges import RobotRanges, draw_robot
 from elastic_env.world.scenario import Scenario
 
 MOTOR = Motor(torque_constant=0.4, back_emf=0.5, resistance=3.0, voltage=5.0, pwm_limit=0.9)

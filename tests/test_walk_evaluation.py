@@ -29,14 +29,14 @@ from train.commands.compare_config import CompareConfig
 from train.commands.comparison import try_out
 from train.evaluate.conditions import Condition, PolicySpec
 from train.evaluate.episodes import Evaluation, evaluate
-from train.evaluate.rollout import make_vector_env
-from train.evaluate.support_changes import (
+from train.evaluate.local_frame_error import (
     SupportChanges,
     com_jump,
     frame_error,
     support_changes,
     tilt,
 )
+from train.evaluate.rollout import make_vector_env
 from train.figures.colours import policy_colours
 from train.figures.comparison_figures import (
     draw_signals,

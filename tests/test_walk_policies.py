@@ -19,7 +19,7 @@ from baselines.compensation.oracle import Oracle, TrueSensors
 from baselines.compensation.policy import Zero
 from baselines.policies import sensors_needed
 from baselines.walking.controller import WalkingController, WalkingGains
-from baselines.walking.refined_walk import RefinedWalk, refine_model
+from baselines.walking.refined_plan import RefinedWalk, refine_model
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
 

@@ -101,7 +101,7 @@ def remembered(memory: Any) -> Array:
     feedback = memory.own[0]
     estimate = memory.inner.estimator.observer[0]
     rolls = [estimate["unknowns"][:, 0], estimate["covariance"][:, 0]]
-    posture = [feedback[name] for name in ("tilt", "integral", "trim", "kept")]
+    posture = [feedback[name] for name in ("tilt", "integral", "trim", "leg_pitch")]
     return np.concatenate([memory.inner.correction[0, [1, 7]], *map(np.ravel, rolls), *posture])
 
 

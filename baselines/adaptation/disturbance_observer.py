@@ -26,8 +26,8 @@ of link and spring. Its gain there is
 The bound is 0.12 s on the testbed for a K that is 30 % below the assumed one. The default T is 0.3
 s: thirty samples of an IMU at 100 Hz, and 75 control periods.
 
-The IMU has an offset. Where the model says that the joint starts without load, encoder and IMU must
-agree, and their difference is averaged before the observer begins. So a disturbance that acts from
+The IMU has an offset. Where the joint starts without load by the model, encoder and IMU must agree,
+and their difference is averaged before the observer begins. So a disturbance that acts from
 the start is not observed.
 
 [Nakao1987] M. Nakao, K. Ohnishi, K. Miyachi, "A Robust Decentralized Joint Control Based on
@@ -44,8 +44,9 @@ from typing_extensions import override
 
 from baselines.compensation.compensators import GravityCompensator
 from baselines.compensation.dry_friction import presliding_friction
+from baselines.compensation.filters import filter_share
 from baselines.compensation.measured import require_sensor
-from baselines.compensation.policy import PolicyAround, PolicyInputs, Step, filter_share
+from baselines.compensation.policy import PolicyAround, PolicyInputs, Step
 from baselines.compensation.startup import Ramp
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array, IntArray
@@ -161,7 +162,8 @@ class DisturbanceObserver(PolicyAround):
         action, inner = self.policy.act(rows, memory.inner, inputs)
         steps = memory.steps + 1
         joints = self._observe(rows, steps, memory.joints)
-        lead = self._ramp.take(steps, mode="clip") * joints.disturbance / self.model.stiffness
+        share = self._ramp.take(steps, mode="clip")
+        lead = share * joints.disturbance / self.model.stiffness
         memory = ObserverMemory(steps, joints, inner)
         return (action + lead).astype(np.float32), memory
 
@@ -192,22 +194,24 @@ class DisturbanceObserver(PolicyAround):
 
         def smooth(value: Array, before: Array) -> Array:
             """Value behind the common filter."""
-            return np.where(is_zeroing, value, before + self._smooth_share * (value - before))
+            filtered = before + self._smooth_share * (value - before)
+            return np.where(is_zeroing, value, filtered)
 
         delta = smooth(deflection, last.smooth_deflection)
         delta_dot = (deflection - delta) / gains.rate_filter_s
         q = smooth(theta - deflection, last.smooth_q)
         q_dot = (theta - deflection - q) / gains.rate_filter_s
-        smooth_friction = smooth(friction, last.smooth_friction)
+        known_friction = smooth(friction, last.smooth_friction)
         passed = joint_torque(delta, delta_dot, model.stiffness, model.damping, model.backlash)
-        needed = self._static.gravity.inverse_dynamics(q, q_dot, (q_dot - last.rate) / dt)
+        q_ddot = (q_dot - last.rate) / dt
+        needed = self._static.gravity.inverse_dynamics(q, q_dot, q_ddot)
         # at rest dry friction takes any value up to F: only torque beyond is a disturbance
         excess = passed - needed - last.disturbance
         static = np.clip(excess, -self._coulomb, self._coulomb)
-        friction_torque = np.where(q_ref_dot == 0.0, static, smooth_friction)
+        friction_torque = np.where(q_ref_dot == 0.0, static, known_friction)
         missing = np.where(is_zeroing, 0.0, passed - needed - friction_torque)
-        disturbance = last.disturbance + self._follow_share * (missing - last.disturbance)
-        disturbance = np.clip(disturbance, -gains.limit_nm, gains.limit_nm)
+        estimate = last.disturbance + self._follow_share * (missing - last.disturbance)
+        estimate = np.clip(estimate, -gains.limit_nm, gains.limit_nm)
         return JointObservation(
-            offset, imu, deflection, friction, delta, q, smooth_friction, q_dot, disturbance
+            offset, imu, deflection, friction, delta, q, known_friction, q_dot, estimate
         )

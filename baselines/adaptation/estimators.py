@@ -39,7 +39,7 @@ from baselines.compensation.dry_friction import presliding_friction
 from baselines.compensation.gravity_torque import make_gravity
 from baselines.compensation.measured import DeflectionSensors
 from baselines.compensation.observation_view import ObservationView
-from baselines.estimation.bending import BendingObserver
+from baselines.estimation.model_error import BendingObserver
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array, SignalTable
 from elastic_env.world.robot_model import RobotModel, WalkerModel
@@ -135,7 +135,8 @@ class LegEstimator(Estimator):
 
     @override
     def begin(self, num_worlds: int) -> EstimatorMemory:
-        return EstimatorMemory(np.zeros((num_worlds, 2)), self.observer.begin(num_worlds))
+        loads = np.zeros((num_worlds, 2))
+        return EstimatorMemory(loads, self.observer.begin(num_worlds))
 
     def observe(self, rows: Array, memory: EstimatorMemory) -> tuple[Array, Array, Any]:
         """Values of the observer, the mean excess load, (num_worlds, 1) [1], and new memory."""
@@ -198,7 +199,8 @@ class EncoderEstimator(Estimator):
         deflection = self._sensors.deflection(rows)
         q = self._view.theta(rows) - deflection
         displacement = np.where(memory.sums[:, 0] > 0.0, q - memory.q, 0.0)
-        friction = presliding_friction(memory.friction, displacement, self._model.coulomb_friction)
+        coulomb = self._model.coulomb_friction
+        friction = presliding_friction(memory.friction, displacement, coulomb)
         h = self._expected_deflection(rows, q, friction)
         y = deflection - h
         terms = np.stack([np.ones_like(h), h, h * h, y, h * y], axis=1)

@@ -59,7 +59,7 @@ class LearnedOffsets(PolicyAround):
         Row t acts in the period that ends t periods after the start.
         """
         share = self._ramp.share(np.arange(tables.shape[1], dtype=np.float64))[:, None]
-        self._offsets = np.stack([self._signals.offsets(share * table) for table in tables])
+        self._offsets = np.stack([self._signals.offsets(share * t) for t in tables])
         self.tables = tables
 
     @override
@@ -70,8 +70,8 @@ class LearnedOffsets(PolicyAround):
         tables = len(self._offsets)
         if tables not in (1, len(rows)):
             raise ElasticError(
-                f"the offsets were learned in {tables} worlds, one each, and are played in"
-                f" {len(rows)}"
+                f"the offsets were learned in {tables} worlds, one each, and are"
+                f" played in {len(rows)}"
             )
         row = np.minimum(steps, self._offsets.shape[1] - 1)
         offsets = self._offsets[np.arange(len(rows)) if tables > 1 else 0, row]
@@ -140,11 +140,11 @@ class IterativeLearner(LearnedOffsets):
         # the first error of a world has no limit
         last = np.where(np.isfinite(before), before, np.nan_to_num(trial.error))
         errors = limit_surprise(trial.error, last, surprise)
-        next_tables = np.empty_like(tables)
-        for world, table in enumerate(tables):
-            next_tables[world] = update(table, errors[world], gains, self._period_s, trial.number)
+        updated = np.empty_like(tables)
+        for world, (table, error) in enumerate(zip(tables, errors, strict=True)):
+            updated[world] = update(table, error, gains, self._period_s, trial.number)
         failed = trial.failed[:, None, None]
-        tables = np.where(failed, _SHARE_AFTER_FAILURE * tables, next_tables)
+        tables = np.where(failed, _SHARE_AFTER_FAILURE * tables, updated)
         return tables, np.where(failed, before, errors)
 
 
@@ -203,4 +203,5 @@ class Trials:
 
 def _noise_seed(robot: int, number: int) -> int:
     """Seed of a trial's noise, different for every trial, and from the seed of the robot."""
-    return int(np.random.SeedSequence([robot, number]).generate_state(1, np.uint64)[0] >> 1)
+    sequence = np.random.SeedSequence([robot, number])
+    return int(sequence.generate_state(1, np.uint64)[0] >> 1)

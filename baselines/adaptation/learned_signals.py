@@ -128,15 +128,15 @@ class JointSignals(LearnedSignals):
         self._encoder = table.group(LINK_ENCODER) if has_encoders else None
         if self._encoder is None and len(joints) > 1:
             raise ConfigurationError(
-                f"learning the offsets of {len(joints)} joints needs their links measured; make the"
-                f" environment with sensors=[{LINK_ENCODER!r}]"
+                f"learning the offsets of {len(joints)} joints needs their links"
+                f" measured; make the environment with sensors=[{LINK_ENCODER!r}]"
             )
 
     @override
     def error(self, before: Array, after: Array, info: Mapping[str, Any]) -> Array:
-        by_imu = self._encoder is None
-        link = np.reshape(info[_LINK_ANGLE], (-1, 1)) if by_imu else after[:, self._encoder]
-        return before[:, self._reference] - link
+        if self._encoder is None:
+            return before[:, self._reference] - np.reshape(info[_LINK_ANGLE], (-1, 1))
+        return before[:, self._reference] - after[:, self._encoder]
 
     @override
     def offsets(self, table: Array) -> Array:

@@ -73,6 +73,7 @@ def zero_phase(table: Array, cutoff_hz: float, period_s: float) -> Array:
     from scipy import signal
 
     sections = signal.butter(_FILTER_ORDER, cutoff_hz, fs=1.0 / period_s, output="sos")
+    # a period of the cutoff at both ends
     padding = min(round(1.0 / (cutoff_hz * period_s)), len(table) - 1)
     return signal.sosfiltfilt(sections, table, axis=0, padlen=padding)
 

@@ -55,7 +55,7 @@ class TableDescription(Model):
 def motion_of(env: Any) -> dict[str, Any]:
     """Gait or reference of an environment."""
     config = env.unwrapped.task.config
-    return (config.gait if hasattr(config, "gait") else config.reference).model_dump(mode="json")
+    return (getattr(config, "gait", None) or config.reference).model_dump(mode="json")
 
 
 def save_table(folder: Path, description: TableDescription, table: Array) -> None:

@@ -13,8 +13,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from typing_extensions import override
 
+from baselines.compensation.filters import filter_share
 from baselines.compensation.memory import put_rows, select_rows
-from baselines.compensation.policy import PolicyAround, PolicyInputs, Step, filter_share
+from baselines.compensation.policy import PolicyAround, PolicyInputs, Step
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array, IntArray
 from elastic_env.world.robot_model import RobotModel
@@ -91,10 +92,10 @@ class OnlineStiffness(PolicyAround):
         if np.count_nonzero(memory.wait) < len(rows):
             due = memory.wait == 0
             wait[due] = self.every - 1
-            estimate, after = self.estimator.estimate(rows[due], select_rows(state, due))
+            estimate, new = self.estimator.estimate(rows[due], select_rows(state, due))
             estimate = np.clip(estimate, -self.limit, self.limit)
             target = put_rows(target, due, estimate)
-            state = put_rows(state, due, after)
+            state = put_rows(state, due, new)
         correction = memory.correction + self.share * (target - memory.correction)
         deflection = correction
         if inputs.deflection is not None:

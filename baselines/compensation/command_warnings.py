@@ -51,9 +51,9 @@ class CommandWarnings:
             ends = f"{self.lowest[worst]:.4g} to {self.highest[worst]:.4g} rad"
             self._warn_once(
                 "range",
-                f"joint {self.joints[worst]!r} needs the command {command[worst]:.4g} rad, beyond"
-                f" its range of {ends} in the model: its link stays {excess[worst]:.2g} rad short;"
-                " keep q_desired that far from the end",
+                f"joint {self.joints[worst]!r} needs the command {command[worst]:.4g}"
+                f" rad, beyond its range of {ends} in the model: its link stays"
+                f" {excess[worst]:.2g} rad short; keep q_desired that far from the end",
             )
 
     def warn_of_limit(self, offsets: Array, when: str) -> None:
@@ -81,8 +81,8 @@ class CommandWarnings:
             cure = "set the payload to 0 where it was, and let ramp_s pass before"
         self._warn_once(
             "jump",
-            f"the payload moves the command of joint {self.joints[worst]!r} by {1e3 * size:.3g}"
-            f" mrad at once; {cure}",
+            f"the payload moves the command of joint {self.joints[worst]!r} by"
+            f" {1e3 * size:.3g} mrad at once; {cure}",
         )
 
     def _warn_once(self, topic: str, text: str) -> None:

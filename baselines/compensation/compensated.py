@@ -39,7 +39,7 @@ class Compensated(PolicyAround):
     The action a of the policy inside is the offset of its desired link angle, q_d = q_ref + a. It
     sees the estimated link angle and rate instead of the encoder's. The compensator's offset for
     q_d is added to its action. The compensation grows from zero in the first `ramp_s` of an
-    episode, while the reference stands.
+    episode, while the reference is at rest.
 
     Attributes:
         ramp: Share of the compensation after 0, 1, ... control steps, up to 1.
@@ -77,8 +77,8 @@ class Compensated(PolicyAround):
     def begin(self, rows: Array) -> CompensatedMemory:
         motion = self.view.motion(rows)
         steps = np.zeros((len(rows), 1), dtype=np.int64)
-        memory = self.compensator.at(rows).begin(motion)
-        return CompensatedMemory(steps, motion.q.copy(), memory, self.policy.begin(rows))
+        state = self.compensator.at(rows).begin(motion)
+        return CompensatedMemory(steps, motion.q.copy(), state, self.policy.begin(rows))
 
     @override
     def act(self, rows: Array, memory: CompensatedMemory, inputs: PolicyInputs) -> Step:
@@ -94,7 +94,7 @@ class Compensated(PolicyAround):
             view, feet = self._plan
             rows = rows.copy()
             shift = np.ascontiguousarray(shift)
-            shift_plan(view.fields(rows), shift, feet, self.compensator.model.control_period_s)
+            shift_plan(view.fields(rows), shift, feet, self.model.control_period_s)
             state = self._begin_shifted(rows, memory)
         compensator = self.compensator.at(rows)
         theta = rows[:, self._theta]
@@ -109,7 +109,8 @@ class Compensated(PolicyAround):
         compensated = rows.copy()
         compensated[:, self._theta] = links
         if self.policy.reads_rates:
-            compensated[:, self._theta_dot] = compensator.link_rate(theta, rows[:, self._theta_dot])
+            rates = compensator.link_rate(theta, rows[:, self._theta_dot])
+            compensated[:, self._theta_dot] = rates
         action, inner = self.policy.act(compensated, memory.inner, inputs)
         action = action.astype(np.float64)
         motion = self.view.motion(rows)

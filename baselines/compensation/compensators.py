@@ -149,8 +149,8 @@ class GravityCompensator(Compensator):
         if self.weighs:
             if not isinstance(model, WalkerModel):
                 raise ConfigurationError(
-                    "the output compensator 'wrench' needs a walker with force-torque sensors at"
-                    " its feet"
+                    "the output compensator 'wrench' needs a walker with force-torque"
+                    " sensors at its feet"
                 )
             self._load = WrenchTorque(model)
 
@@ -172,7 +172,8 @@ class GravityCompensator(Compensator):
 
     @override
     def offset(self, motion: Motion, memory: Array) -> tuple[Array, Array]:
-        return input_offset(motion.q, self.stiffness, self.gravity, self.servo_compliance), memory
+        compliance = self.servo_compliance
+        return input_offset(motion.q, self.stiffness, self.gravity, compliance), memory
 
     @override
     def deflection(self, offset: Array, memory: Array) -> Array:

@@ -41,7 +41,7 @@ def planned_feet(plan: WalkPlan) -> Any:
         soles=plan.ankles[..., :2],  # their middles in the plan's world frame [m]
         yaw=cosine_and_sine(plan.foot_yaw),
         heading=cosine_and_sine(plan.heading),  # of the pelvis
-        across=between / spacing[:, None],  # direction from the right sole to the left one
+        across=between / spacing[:, None],  # direction from right to left sole
         spacing=spacing,  # distance of the soles [m]
     )
 
@@ -209,17 +209,17 @@ def plan_row(obs: Any, period_s: float, periods_ago: float, rows: int) -> int:
 
 
 @compiled
-def measured_loads(observations: Any, gravity: float, is_level: bool, loads: Any) -> None:
+def measured_loads(observations: Any, gravity: float, is_level: bool, out: Any) -> None:
     """Fill in loads by the foot wrenches.
 
     Args:
         observations: Rows with fields.
         gravity: Acceleration of gravity [m/s²].
         is_level: True for a level pelvis, False for a tilt as the IMU measures it.
-        loads: To be filled, rows of `LOADS`.
+        out: To be filled, rows of `LOADS`.
     """
-    for world in range(len(loads)):
-        load = loads[world]
+    for world in range(len(out)):
+        load = out[world]
         obs = observations[world]
         fill_gravity(obs, gravity, is_level, load)
         for foot in range(2):

@@ -100,19 +100,20 @@ class FrictionCompensation:
             speed: ω of the reference, (..., n) [rad/s].
             memory: Memory after the displacement.
         """
-        load = self._load_and_friction(torque, speed, memory)
+        load = self._total_load(torque, speed, memory)
         return passed_torque(load, memory.direction, 0.0, self.load_ratio)
 
     def share(self, torque: Array, speed: Array, memory: FrictionMemory) -> Array:
         """∂τ_J/∂τ, (..., n) [1]; arguments as `joint_torque`."""
-        load = self._load_and_friction(torque, speed, memory)
+        load = self._total_load(torque, speed, memory)
         return 1.0 / (1.0 - memory.direction * self.load_ratio * np.sign(load))
 
     def largest_joint_torque(self, torque: Array) -> Array:
         """Largest τ_J under loads of either sign at rest, (..., n) [N·m] to (..., n) [N·m]."""
-        return passed_torque(np.abs(torque), 1.0, self.coulomb + self.static, self.load_ratio)
+        friction = self.coulomb + self.static
+        return passed_torque(np.abs(torque), 1.0, friction, self.load_ratio)
 
-    def _load_and_friction(self, torque: Array, speed: Array, memory: FrictionMemory) -> Array:
+    def _total_load(self, torque: Array, speed: Array, memory: FrictionMemory) -> Array:
         """Load with the friction that does not grow with it, (..., n) [N·m]."""
         excess = dry_friction(
             speed,

@@ -19,7 +19,7 @@ from baselines.compensation.observation_view import Motion
 from baselines.compensation.records import record_rows
 from elastic_env.core.compiled import compiled, compiled_part
 from elastic_env.core.signals import Array, Parameter
-from elastic_env.joint import elasticity
+from elastic_env.joint.elasticity import static_deflection
 from elastic_env.world.robot_model import RobotModel, WalkerModel
 
 
@@ -65,7 +65,7 @@ class DynamicCompensator(Compensator):
         self.model = model
         self._static = GravityCompensator(model, output, method)
         gravity = self._static.gravity
-        is_walker = isinstance(model, WalkerModel)  # its inverse dynamics are of the plan only
+        is_walker = isinstance(model, WalkerModel)  # only its plan has inverse dynamics
         self._body: Any = PlannedTorque(model, gravity) if is_walker else make_gravity(model)
         self.weighs = output == "wrench"
         self._dt = model.control_period_s
@@ -100,9 +100,9 @@ class DynamicCompensator(Compensator):
 
     def with_stiffness(self, stiffness: Array) -> Self:
         """Compensator with another K, for all worlds or each of them, (..., n) [N·m/rad]."""
-        other = shallow_copy(self)
-        other._stiffness = np.ascontiguousarray(stiffness).reshape(-1, len(self._drives))
-        return other
+        new = shallow_copy(self)
+        new._stiffness = np.ascontiguousarray(stiffness).reshape(-1, len(self._drives))
+        return new
 
     @override
     def begin(self, motion: Motion) -> DriveMemory:
@@ -110,7 +110,7 @@ class DynamicCompensator(Compensator):
         k_i = self._drives["integral_gain"]
         zero = np.zeros_like(torque)
         windup = np.divide(torque, k_i, out=zero.copy(), where=k_i > 0.0)
-        deflection = elasticity.static_deflection(torque, self._stiffness, self._backlash)
+        deflection = static_deflection(torque, self._stiffness, self._backlash)
         friction = self._friction.begin(torque.shape)
         return DriveMemory(deflection, rate=zero, windup=windup, friction=friction)
 
@@ -128,7 +128,7 @@ class DynamicCompensator(Compensator):
             torque = self._friction.joint_torque(torque, motion.q_dot, friction)
         offset, deflection, rate, windup = lead_motors(
             torque=torque,
-            target=elasticity.static_deflection(torque, self._stiffness, self._backlash),
+            target=static_deflection(torque, self._stiffness, self._backlash),
             q_dot=np.ascontiguousarray(motion.q_dot),
             q_ddot=np.ascontiguousarray(motion.q_ddot),
             before=(memory.deflection, memory.rate, memory.windup),

@@ -56,8 +56,8 @@ def make_gravity(model: RobotModel, method: GravityMethod | None = None) -> Any:
         return RigidBody(model.rigid, model.joint_names)
     if is_more_than_gravity:
         raise ConfigurationError(
-            "gravity method 'hinge' has gravity only, but this model has springs of joints"
-            " or gravcomp; choose tree"
+            "gravity method 'hinge' has gravity only, but this model has springs of"
+            " joints or gravcomp; choose tree"
         )
     return HingeTorque(model)
 

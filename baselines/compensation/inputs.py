@@ -70,8 +70,8 @@ def input_signals(name: str, model: RobotModel) -> tuple[Signal, ...]:
     if kind.axes is None:  # a relative change has no sign in the mirror
         columns = dict.fromkeys(model.joint_names, "same")
     if name == COMMAND:
-        pairs = zip(columns, model.observation_table.signals_of("last_command"), strict=True)
-        columns = {column: signal.mirrored for column, signal in pairs}
+        commands = model.observation_table.signals_of("last_command")
+        columns = {c: s.mirrored for c, s in zip(columns, commands, strict=True)}
     return tuple(
         Signal(f"{name}.{column}", kind.unit, kind.meaning, mirrored=mirrored)
         for column, mirrored in columns.items()

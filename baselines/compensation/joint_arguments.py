@@ -52,8 +52,8 @@ def read_joint_file(model: mujoco.MjModel, stiffness: Any, commanded: Any) -> An
     if not rigid or len(left_out) == len(names):
         return mapping
     warn_caller(
-        f"{stiffness} leaves out {', '.join(rigid)}, taken for rigid; write {rigid[0]}: {RIGID},"
-        f" {rigid[0]}: {HELD} or its stiffness K [N·m/rad] there"
+        f"{stiffness} leaves out {', '.join(rigid)}, taken for rigid; write"
+        f" {rigid[0]}: {RIGID}, {rigid[0]}: {HELD} or its stiffness K [N·m/rad] there"
     )
     return mapping | dict.fromkeys(rigid, RIGID)
 
@@ -93,38 +93,38 @@ def read_stiffness(
     for name in joints:
         if name in held:
             raise ConfigurationError(
-                f"joint {name!r} is named by `joints`, but {HELD} in stiffness; give it a"
-                " stiffness K [N·m/rad], or leave it out of `joints`"
+                f"joint {name!r} is named by `joints`, but {HELD} in stiffness; give"
+                " it a stiffness K [N·m/rad], or leave it out of `joints`"
             )
     require_known_torque(model, joints)
     if not isinstance(stiffness, Mapping):
-        settings = read_joints(_numbers_by_joint("stiffness", stiffness, joints), joints)
+        settings = read_joints(_map_by_joint("stiffness", stiffness, joints), joints)
     commanded: dict[str, JointSettings] = {}
     for name in joints:
         joint = settings.get(name)
         if joint is None:
             raise ConfigurationError(
-                f"stiffness of joint {name!r} is missing; give {name!r} or a pattern such as '*',"
-                " and inf for a rigid joint. It is measured by a known torque and the deflection"
-                " under it"
+                f"stiffness of joint {name!r} is missing; give {name!r} or a pattern"
+                " such as '*', and inf for a rigid joint. It is measured by a known"
+                " torque and the deflection under it"
             )
         if joint.backlash > 0.0:
             raise ConfigurationError(
-                f"backlash of joint {name!r} is {joint.backlash:g} rad, which this compensator"
-                f" cannot take away: at rest {joint.backlash / 2.0:g} rad remain to either side;"
-                " leave the key out of what you give it"
+                f"backlash of joint {name!r} is {joint.backlash:g} rad, which this"
+                f" compensator cannot take away: at rest {joint.backlash / 2.0:g} rad"
+                " remain to either side; leave the key out of what you give it"
             )
         commanded[name] = joint
     return commanded
 
 
-def servo_gains(model: mujoco.MjModel, settings: _Settings, position_gain: Any) -> Array:
+def servo_gains(model: mujoco.MjModel, settings: _Settings, argument: Any) -> Array:
     """k_p of servos that give way, infinite for servos that hold their angle, (n,) [N·m/rad].
 
     Args:
         model: Compiled rigid model; its position actuators give what `settings` leave out.
         settings: Commanded joints.
-        position_gain: The argument; None for the servos of `settings`.
+        argument: `position_gain`; None for the servos of `settings`.
 
     Raises:
         ConfigurationError: A value is missing, given twice, or cannot be used.
@@ -132,13 +132,13 @@ def servo_gains(model: mujoco.MjModel, settings: _Settings, position_gain: Any) 
     Warns:
         UserWarning: Servos of the model give way, and neither argument gives their k_p.
     """
-    if position_gain is not None:
-        return _read_gains(model, settings, position_gain)
+    if argument is not None:
+        return _read_gains(model, settings, argument)
     gains: list[float] = []
     ignored: dict[str, float] = {}
     for joint, joint_settings in settings.items():
         servo = joint_settings.servo
-        actuator = None if servo.position_gain is not None else position_servo(model, joint)
+        actuator = position_servo(model, joint) if servo.position_gain is None else None
         of_model = ServoSettings() if actuator is None else actuator.settings
         if _has_gains(servo):
             gains.append(servo.over(of_model).sagging_gain(joint))
@@ -149,9 +149,9 @@ def servo_gains(model: mujoco.MjModel, settings: _Settings, position_gain: Any) 
     if ignored:
         listed = ", ".join(f"{name}: {gain:g}" for name, gain in ignored.items())
         warn_caller(
-            "the model has position servos that give way under a load, which is not compensated;"
-            f" give position_gain={{{listed}}} [N·m/rad], or position_gain=math.inf for servos that"
-            " hold their angle"
+            "the model has position servos that give way under a load, which is not"
+            f" compensated; give position_gain={{{listed}}} [N·m/rad], or"
+            " position_gain=math.inf for servos that hold their angle"
         )
     return np.array(gains)
 
@@ -166,7 +166,7 @@ def make_friction(settings: _Settings, friction: bool | None) -> FrictionCompens
     """
     joints = list(settings.values())
     if friction is None:
-        friction = any(joint.load_friction > 0.0 or joint.static_friction > 0.0 for joint in joints)
+        friction = any(j.load_friction > 0.0 or j.static_friction > 0.0 for j in joints)
     if not friction:
         return None
     return FrictionCompensation(
@@ -181,9 +181,9 @@ def _has_gains(servo: ServoSettings) -> bool:
     return servo.position_gain is not None or servo.integral_gain is not None
 
 
-def _read_gains(model: mujoco.MjModel, settings: _Settings, position_gain: Any) -> Array:
+def _read_gains(model: mujoco.MjModel, settings: _Settings, argument: Any) -> Array:
     """The argument `position_gain`, (n,) [N·m/rad]."""
-    by_joint = _numbers_by_joint("position_gain", position_gain, list(settings))
+    by_joint = _map_by_joint("position_gain", argument, list(settings))
     names = _joint_names(model)
     for key in by_joint:
         if not isinstance(key, str) or not any(key_of([key], name) for name in names):
@@ -192,14 +192,14 @@ def _read_gains(model: mujoco.MjModel, settings: _Settings, position_gain: Any) 
     for joint, joint_settings in settings.items():
         if _has_gains(joint_settings.servo):
             raise ConfigurationError(
-                f"the servo of joint {joint!r} is given twice, under `servo` in stiffness and by"
-                " position_gain; keep one of them"
+                f"the servo of joint {joint!r} is given twice, under `servo` in"
+                " stiffness and by position_gain; keep one of them"
             )
         key = key_of(by_joint, joint)
         if key is None:
             raise ConfigurationError(
-                f"position_gain of joint {joint!r} is missing; give {joint!r} or a pattern such as"
-                " '*', and inf for a servo that holds its angle"
+                f"position_gain of joint {joint!r} is missing; give {joint!r} or a"
+                " pattern such as '*', and inf for a servo that holds its angle"
             )
         try:
             gains.append(PositionGain(position_gain=by_joint[key]).position_gain)
@@ -208,7 +208,7 @@ def _read_gains(model: mujoco.MjModel, settings: _Settings, position_gain: Any) 
     return np.array(gains)
 
 
-def _numbers_by_joint(name: str, given: Any, joints: Sequence[str]) -> Mapping[str, Any]:
+def _map_by_joint(name: str, given: Any, joints: Sequence[str]) -> Mapping[str, Any]:
     """Numbers by joints' names or patterns."""
     if given is None or isinstance(given, str | Path):
         raise ConfigurationError(

@@ -2,8 +2,8 @@ r"""Link angles by sensors, instead of an output compensator.
 
 | sensor | deflection | source |
 |---|---|---|
-| joint torque sensors | :math:`\delta = K^{-1} \tau_J` with the assumed K, whatever the load | [7], [12] of the paper |
-| link encoders | :math:`\delta = \theta - q`, whatever K and load | [10] of the paper, at the hips alone |
+| joint torque sensors | :math:`\delta = K^{-1} \tau_J` with the assumed K, for any load | [7], [12] of the paper |
+| link encoders | :math:`\delta = \theta - q`, for any K and load | [10] of the paper, at the hips alone |
 
 A policy sees θ − δ at once. The command must not lead by the measured δ at once: where both feet
 stand, the legs form a closed chain, and δ changes by as much as the command. So the command leads
@@ -39,8 +39,8 @@ def require_sensor(table: SignalTable, sensor: str, group: str | None = None) ->
     """
     if (group or sensor) not in {name.split(".")[0] for name in table.names}:
         raise ConfigurationError(
-            f"this policy reads {sensor}, which the environment does not have; make it with"
-            f" sensors=[{sensor!r}]"
+            f"this policy reads {sensor}, which the environment does not have; make it"
+            f" with sensors=[{sensor!r}]"
         )
 
 

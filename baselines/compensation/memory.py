@@ -67,5 +67,5 @@ def _map_arrays(function: Callable[..., Array], memory: Any, *others: Any) -> An
         return function(memory, *others)
     if not isinstance(memory, tuple):
         return memory
-    parts = [_map_arrays(function, *fields) for fields in zip(memory, *others, strict=True)]
+    parts = [_map_arrays(function, *part) for part in zip(memory, *others, strict=True)]
     return type(memory)(*parts) if hasattr(memory, "_fields") else tuple(parts)

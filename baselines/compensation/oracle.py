@@ -97,7 +97,8 @@ class TrueCompensator(DynamicCompensator):
         offset, drives = super().offset(motion, memory.drives)
         if self._gain == 0.0:
             return offset, memory._replace(drives=drives)
-        error = np.where(self._ramp.is_over(memory.steps), memory.target - self._truth.q, 0.0)
+        is_over = self._ramp.is_over(memory.steps)
+        error = np.where(is_over, memory.target - self._truth.q, 0.0)
         correction = memory.correction + self._gain * error
         correction = np.minimum(np.maximum(correction, -_LIMIT_RAD), _LIMIT_RAD)
         memory = TrueMemory(memory.steps + 1, correction, motion.q, drives)
@@ -159,7 +160,8 @@ class TrueSensors(PassingMemory):
         self._env = env.unwrapped
         super().__init__(policy, self._env.assumed_model)
         table = self.model.observation_table
-        self._columns = [table.group(group) for group in ("imu_attitude", "imu_rate", "wrench")]
+        names = ("imu_attitude", "imu_rate", "wrench")
+        self._columns = [table.group(name) for name in names]
 
     @override
     def act(self, rows: Array, memory: Any, inputs: PolicyInputs) -> Step:

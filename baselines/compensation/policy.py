@@ -201,7 +201,8 @@ class PolicyAround(BatchPolicy):
 
     @override
     def begin(self, rows: Array) -> Any:
-        return MemoryAround(np.zeros(len(rows), self.memory_type), self.policy.begin(rows))
+        own = np.zeros(len(rows), self.memory_type)
+        return MemoryAround(own, self.policy.begin(rows))
 
     def inner_memory(self, memory: Any) -> Any:
         """Memory of the policy inside."""
@@ -271,7 +272,8 @@ class UserPolicy(BatchPolicy):
     def act(self, rows: Array, memory: UserMemory, inputs: PolicyInputs) -> Step:
         obs = rows[0] if inputs.is_single else rows
         start = ~memory.has_begun
-        action, state = self._policy.predict(obs, memory.state[0], start, inputs.deterministic)
+        state = memory.state[0]
+        action, state = self._policy.predict(obs, state, start, inputs.deterministic)
         offset = np.atleast_2d(np.asarray(action, dtype=np.float64))
         return offset, UserMemory(np.ones(len(rows), dtype=np.bool_), [state])
 
@@ -288,8 +290,3 @@ def as_batch_policy(policy: Any, model: RobotModel) -> BatchPolicy:
 def as_action(offsets: Array, is_single: bool) -> Action:
     """Offsets in single precision: all rows, or the only row for an observation of one world."""
     return (offsets[0] if is_single else offsets).astype(np.float32, copy=False)
-
-
-def filter_share(period_s: float, time_constant_s: float) -> float:
-    """Share of its remaining way that a first-order filter goes in a period [1]."""
-    return 1.0 - float(np.exp(-period_s / time_constant_s))

@@ -23,7 +23,7 @@ from typing import Any, Self
 
 import mujoco
 import numpy as np
-import numpy.typing as npt
+from numpy.typing import ArrayLike
 from scipy.linalg import get_lapack_funcs
 
 from baselines.compensation.command_warnings import CommandWarnings
@@ -48,7 +48,7 @@ from elastic_env.motion.trajectory import minimum_jerk
 from elastic_env.rigid.rigid_body import RigidBody
 from elastic_env.world.robot_model import joint_ranges
 
-Rates = npt.ArrayLike | None
+Rates = ArrayLike | None
 """Rates or accelerations of a motion; None at rest."""
 _Motion = tuple[Array, Array | None, Array | None]
 """Angles, rates and accelerations of the links, (n,) each; None for none."""
@@ -81,7 +81,8 @@ class CompensatorConstants:
         ramp_steps: Commands within which an offset or a payload grows; 0 for at once.
         period_s: Time between two commands [s].
         friction: Dry friction; None where it is not compensated.
-        viscous: Viscous friction, (n,) [N·m·s/rad]; it and the next three are for dry friction.
+        viscous: Viscous friction, (n,) [N·m·s/rad]. It and the next three are used only with
+            `friction`.
         lag_s: Lag of the servos, (n,) [s].
         fastest: No-load speed of the servos, infinite where it is not known, (n,) [rad/s].
         rotor_s2: Lag behind an acceleration, B/k_p, (n,) [s²].
@@ -161,7 +162,8 @@ class PositionCompensator:
         require_robot(model)
         leaves_out_held = joints is None
         if joints is None:
-            joints = commanded_hinges(model, stiffness if isinstance(stiffness, Mapping) else ())
+            named = stiffness if isinstance(stiffness, Mapping) else ()
+            joints = commanded_hinges(model, named)
         self.settings = read_stiffness(model, stiffness, joints, leaves_out_held)
         self.joints = tuple(self.settings)
         settings = list(self.settings.values())
@@ -172,7 +174,7 @@ class PositionCompensator:
         self.constants = CompensatorConstants(
             model=model,
             body=RigidBody(model, self.joints, held_positions(model, self.joints)),
-            tip=max(int(model.jnt_bodyid[model.joint(name).id]) for name in self.joints),
+            tip=max(int(model.joint(name).bodyid[0]) for name in self.joints),
             compliance=compliance,
             of_command=compliance + 1.0 / gains,
             lowest=lowest,
@@ -181,10 +183,10 @@ class PositionCompensator:
             ramp_steps=int(np.ceil(limits.ramp_s / limits.period_s)),
             period_s=limits.period_s,
             friction=make_friction(self.settings, friction),
-            viscous=np.array([joint.viscous_friction or 0.0 for joint in settings]),
-            lag_s=np.array([joint.servo.braking for joint in settings]) / gains,
-            fastest=np.array([joint.servo.fastest for joint in settings]),
-            rotor_s2=np.array([joint.rotor_inertia or 0.0 for joint in settings]) / gains,
+            viscous=np.array([j.viscous_friction or 0.0 for j in settings]),
+            lag_s=np.array([j.servo.braking for j in settings]) / gains,
+            fastest=np.array([j.servo.fastest for j in settings]),
+            rotor_s2=np.array([j.rotor_inertia or 0.0 for j in settings]) / gains,
         )
         self._warnings = CommandWarnings(self.joints, lowest, highest, limits.limit_rad)
         self.reset()
@@ -230,7 +232,7 @@ class PositionCompensator:
         self.clipped: BoolArray = np.zeros(len(self.joints), dtype=np.bool_)
 
     def set_payload(
-        self, mass_kg: float, at: npt.ArrayLike = (0, 0, 0), body: str | None = None
+        self, mass_kg: float, at: ArrayLike = (0, 0, 0), body: str | None = None
     ) -> None:
         """Let the robot carry another point mass.
 
@@ -261,11 +263,11 @@ class PositionCompensator:
         jump = self.constants.of_command * (self._last_joint_torque() - torque_before)
         self._warnings.warn_of_jump(jump, has_ramp=steps > 0)
 
-    def torque(self, q: npt.ArrayLike, q_dot: Rates = None, q_ddot: Rates = None) -> Array:
+    def torque(self, q: ArrayLike, q_dot: Rates = None, q_ddot: Rates = None) -> Array:
         """Torque that the joints have to deliver, (n,) [N·m]; arguments and errors as `command`."""
         return self._torque(*self._read_motion(q, q_dot, q_ddot))
 
-    def command(self, q_desired: npt.ArrayLike, q_dot: Rates = None, q_ddot: Rates = None) -> Array:
+    def command(self, q_desired: ArrayLike, q_dot: Rates = None, q_ddot: Rates = None) -> Array:
         """Servo command that brings the links to their desired angles.
 
         Args:
@@ -299,7 +301,7 @@ class PositionCompensator:
             self._warnings.warn_of_range(wanted)
         return command
 
-    def link_angle(self, theta: npt.ArrayLike) -> Array:
+    def link_angle(self, theta: ArrayLike) -> Array:
         """Link angles at rest for motor encoders at θ: Eq. 10.
 
         Compensated friction holds the link back against the direction of the last commands.
@@ -351,10 +353,10 @@ class PositionCompensator:
         q, q_dot, q_ddot = motion
         last = self._last_motion
         displacement = np.zeros_like(q) if last is None else q - last[0]
-        slack = self._friction_memory.slack
-        self._friction_memory = constants.friction.follow(displacement, self._friction_memory)
+        before = self._friction_memory
+        after = self._friction_memory = constants.friction.follow(displacement, before)
         if q_dot is None:  # without motion in the dead zone
-            q_dot = (displacement + slack - self._friction_memory.slack) / constants.period_s
+            q_dot = (displacement + before.slack - after.slack) / constants.period_s
             q_dot[np.abs(q_dot) > constants.fastest] = 0.0  # a new pose, no motion
         lag = constants.lag_s * q_dot
         if q_ddot is not None:
@@ -385,17 +387,19 @@ class PositionCompensator:
     def _joint_torque_at_rest(self, q: Array) -> Array:
         """τ_J of links at rest, (..., n) [rad] to (..., n) [N·m]."""
         torque = self.constants.body.gravity_torque(q)
-        if self.constants.friction is None:
+        friction = self.constants.friction
+        if friction is None:
             return torque
-        return self.constants.friction.joint_torque(torque, np.zeros_like(q), self._friction_memory)
+        return friction.joint_torque(torque, np.zeros_like(q), self._friction_memory)
 
     def _joint_torque_gradient(self, q: Array) -> Array:
         """Gradient of τ_J at rest, (..., n) [rad] to (..., n, n) [N·m/rad]."""
         gradient = self.constants.body.gravity_gradient(q)
-        if self.constants.friction is None:
+        friction = self.constants.friction
+        if friction is None:
             return gradient
         torque = self.constants.body.gravity_torque(q)
-        share = self.constants.friction.share(torque, np.zeros_like(q), self._friction_memory)
+        share = friction.share(torque, np.zeros_like(q), self._friction_memory)
         return share[..., None] * gradient
 
     def _soft_link_angle(self, theta: Array, guess: Array | None) -> Array:

@@ -39,7 +39,8 @@ class Ramp:
             # springs in series with the servos that hold their motor side [N·m/rad]
             servo = np.array([servo.position_gain for servo in model.servos])
             series = 1.0 / (1.0 / model.stiffness + 1.0 / servo)
-            sway = sway_frequencies(model.biped, model.plan.pelvis[0], series, model.plan.ankles[0])
+            plan = model.plan
+            sway = sway_frequencies(model.biped, plan.pelvis[0], series, plan.ankles[0])
             half_period = np.pi / sway[0]
             if half_period <= (1.0 - _SHORTEST_HALF) * duration_s:  # false for nan
                 self._delay = float(half_period)

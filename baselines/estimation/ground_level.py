@@ -15,8 +15,8 @@ center of mass, h over the ankles. Set upright, it gives the wrenches of level g
 .. math:: f' = R f, \qquad m' = m + h \hat z \times (f' - f)
 
 A leaning weight bends the legs further than an upright one, s and s' by the model
-(`baselines.estimation.bending`), each leg by its share w of the load. Level ground excludes that
-too, so that the robot's own tilt is
+(`baselines.estimation.model_error`), each leg by its share w of the load. Level ground excludes
+that too, so that the robot's own tilt is
 
 .. math:: \text{attitude} - \lambda - \sum_{legs} w (s - s')
 
@@ -28,8 +28,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from baselines.compensation.policy import filter_share
-from baselines.estimation.bending import LOADED_SHARE, BendingObserver
+from baselines.compensation.filters import filter_share
+from baselines.estimation.model_error import LOADED_SHARE, BendingObserver
 from elastic_env.core.signals import Array, rename_group
 from elastic_env.rigid.leg_kinematics import rotation_of_tilt
 from elastic_env.world.robot_model import WalkerModel
@@ -70,7 +70,8 @@ class GroundLevel:
         self._attitude = table.group("imu_attitude")
         self._wrench = table.group("wrench")
         own_tilt = rename_group(table.signals_of("imu_attitude"), "own_tilt")
-        self.signals = (*own_tilt, *rename_group(table.signals_of("wrench"), "level_wrench"))
+        wrench = rename_group(table.signals_of("wrench"), "level_wrench")
+        self.signals = (*own_tilt, *wrench)
         """Values of `observe`."""
         self._theta = table.group("encoder_angle")
         self._rate = table.group("encoder_rate")
@@ -122,7 +123,8 @@ class GroundLevel:
 
     def _mean(self, force: Array, velocity: Array, memory: Any) -> tuple[Array, Array]:
         """Mean after a measurement, about x and y [rad], and the number of measurements in it."""
-        is_known = (force[:, 2] >= self._least_n) & np.isfinite(memory.velocity).all(axis=1)
+        has_velocity = np.isfinite(memory.velocity).all(axis=1)
+        is_known = (force[:, 2] >= self._least_n) & has_velocity
         accelerated = (velocity - memory.velocity) / (self._period_s * self._gravity)
         direction = force[:, :2] / np.where(is_known, force[:, 2], np.inf)[:, None]
         lean = direction - np.where(is_known[:, None], accelerated, 0.0)

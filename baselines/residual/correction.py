@@ -118,7 +118,8 @@ class Corrected:
 
     def base_action(self, rows: Array, state: Any, episode_start: Any) -> Array:
         """Command of the base alone, (num_worlds, n) [rad]."""
-        return self.base.act(rows, self.base_memory(rows, state, episode_start), NO_INPUTS)[0]
+        memory = self.base_memory(rows, state, episode_start)
+        return self.base.act(rows, memory, NO_INPUTS)[0]
 
     def link_estimate(self, observation: Array, state: Any) -> Array:
         """Estimated link angles for an observation and the state after it, (..., n) [rad]."""
@@ -166,7 +167,7 @@ class Channels:
         order = {name: number for number, name in enumerate(signals)}
         self.source = np.array([order.get(source or "", 0) for source in sources])
         ends = {"low": -1.0, "high": 1.0}
-        self.signals = tuple(replace(s, name=name, **ends) for name, s in signals.items())
+        self.signals = tuple(replace(s, name=key, **ends) for key, s in signals.items())
 
     def approach(self, values: Array, residual: Array, share: float) -> Array:
         """Values of all columns after a share of their way to a residual, (num_worlds, width).
@@ -176,29 +177,30 @@ class Channels:
             residual: Within [−1, 1], (num_worlds, k).
             share: 1 for the whole way.
         """
-        return values + share * (self.bounds * residual.take(self.source, axis=1) - values)
+        target = self.bounds * residual.take(self.source, axis=1)
+        return values + share * (target - values)
 
     def parts(self, values: Array) -> dict[str, Array]:
         """Values by input, (..., width) to (..., columns of the input)."""
         return {name: values[..., columns] for name, columns in self._columns.items()}
 
 
-def _column_bounds(name: str, settings: ResidualSettings, joint_names: list[str]) -> Array:
+def _column_bounds(name: str, settings: ResidualSettings, joints: list[str]) -> Array:
     """Bound of every column of an input, (columns,); zero where the residual does not act."""
     kind = INPUTS[name]
     bound = settings.bounds[name]
-    names = kind.columns(joint_names)
+    names = kind.columns(joints)
     chosen = np.ones(len(names), dtype=np.bool_)
-    joints = settings.joints if kind.axes is None else None
-    if joints is not None:
-        chosen = np.any([fit_columns(wanted, names, kind) for wanted in joints], axis=0)
+    wanted_joints = settings.joints if kind.axes is None else None
+    if wanted_joints is not None:
+        chosen = np.any([fit_columns(j, names, kind) for j in wanted_joints], axis=0)
     if not isinstance(bound, dict):
         return np.where(chosen, bound, 0.0)
     bounds = np.zeros(len(names))
     for wanted, value in bound.items():
         bounds[fit_columns(wanted, names, kind)] = value
     missing = np.array(names)[chosen & (bounds == 0.0)].tolist()
-    if missing and joints is not None:
+    if missing and wanted_joints is not None:
         raise ConfigurationError(
             f"{name} must have a bound for every joint of `joints`, none fits {missing}"
         )
@@ -213,7 +215,8 @@ def fit_columns(wanted: str, names: list[str], kind: InputKind) -> BoolArray:
     """
     fits = np.array([name == wanted or name.endswith(f"_{wanted}") for name in names])
     if not fits.any():
-        raise unknown_name("joint" if kind.axes is None else "axis of an input", wanted, names)
+        noun = "joint" if kind.axes is None else "axis of an input"
+        raise unknown_name(noun, wanted, names)
     return fits
 
 

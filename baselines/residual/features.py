@@ -7,10 +7,10 @@
 | `encoder_error` | encoder angles less reference angles, which are small compared with both [rad] |
 | `link_error` | with encoders on the links: reference angles less the links' angles, small too [rad] |
 | `contact_error` | walker: measured ZMP [m] and load share [1] as on level ground, less the planned ones |
-| `zmp_error` | walker: measured ZMP of flat feet less the planned one [m], whatever the ground's tilt adds |
+| `zmp_error` | walker: measured ZMP of flat feet less the planned one [m], with the effect of the ground's tilt |
 | `zmp_of_steps` | walker: mean `zmp_error` in the last step on either foot |
 | `level` | walker: attitude and foot wrenches as on level ground (`baselines.estimation.ground_level`) |
-| `bending` | walker: relative error of the model's bending, and the load (`baselines.estimation.bending`) |
+| `bending` | walker: relative error of the model's bending, and the load (`baselines.estimation.model_error`) |
 | `phase` | walker: the first eight harmonics of the phase of a step [1] |
 | `standing`, `zmp_offset`, `feet`, `landing`, `shear` | estimates of the robot by a base such as `foothold`, from its memory |
 | `base_action` | present command of the base alone [rad] |
@@ -25,8 +25,8 @@ import numpy as np
 
 from baselines.compensation.memory import put_rows, select_rows
 from baselines.compensation.observation_view import ObservationView
-from baselines.estimation.bending import BendingObserver
 from baselines.estimation.ground_level import GroundLevel, GroundMemory
+from baselines.estimation.model_error import BendingObserver
 from baselines.residual.correction import Corrected
 from baselines.residual.mirror import LeftFirst
 from baselines.residual.true_robot import true_robot
@@ -80,12 +80,12 @@ class Features:
         names = _source_names(settings.observe, model)
         self._sources = [_source(name, corrected, period_s) for name in names]
         if settings.privileged:
-            signals, read_truth = true_robot(settings.privileged, model, corrected.truth)
-            self._sources.append(_Instant(signals, lambda rows: read_truth()))  # noqa: ARG005
-        self._reads_base = [getattr(source, "reads_base", False) for source in self._sources]
+            signals, read = true_robot(settings.privileged, model, corrected.truth)
+            self._sources.append(_Instant(signals, lambda rows: read()))  # noqa: ARG005
+        self._reads_base = [getattr(s, "reads_base", False) for s in self._sources]
         self._has_action = BASE_ACTION in settings.observe
         present = [signal for source in self._sources for signal in source.signals]
-        self._measured = np.flatnonzero([signal.kind == "measured" for signal in present])
+        self._measured = np.flatnonzero([s.kind == "measured" for s in present])
         self._history = settings.history
         commands = model.observation_table.signals_of("last_command")
         action = rename_group(commands, BASE_ACTION) if self._has_action else ()
@@ -104,7 +104,7 @@ class Features:
     def begin(self, num_worlds: int) -> FeaturesMemory:
         """Memory before the first decision."""
         past = np.zeros((num_worlds, self._history * len(self._measured)))
-        return FeaturesMemory(past, tuple(source.begin(num_worlds) for source in self._sources))
+        return FeaturesMemory(past, tuple(s.begin(num_worlds) for s in self._sources))
 
     def at(
         self, rows: Array, memory: Any, is_first: BoolArray, state: Any, episode_start: Any
@@ -133,9 +133,10 @@ class Features:
             memories = [base if reads_base else source for reads_base, source in pairs]
         pairs = zip(self._sources, memories, strict=True)
         observed = [source.observe(rows, memory) for source, memory in pairs]
-        present = np.hstack([np.zeros((len(rows), 0)), *(values for values, _ in observed)])
+        present = np.hstack([np.zeros((len(rows), 0)), *(v for v, _ in observed)])
         measured = present[:, self._measured]
-        past = np.where(is_first[:, None], np.tile(measured, (1, self._history)), last.past)
+        repeated = np.tile(measured, (1, self._history))
+        past = np.where(is_first[:, None], repeated, last.past)
         parts = [present]
         if self._has_action:
             action = self._corrected.base_action(rows, state, episode_start)
@@ -144,7 +145,7 @@ class Features:
         if self.mirror is not None:
             features = self.mirror(rows, features)
         next_past = np.hstack([measured, past])[:, : past.shape[1]]
-        return features, FeaturesMemory(next_past, tuple(memory for _, memory in observed))
+        return features, FeaturesMemory(next_past, tuple(m for _, m in observed))
 
     def turn_back(self, rows: Array, residual: Array) -> Array:
         """Residual as it acts, turned back where it was decided in the mirror, (num_worlds, k).
@@ -158,7 +159,8 @@ class Features:
 
 def _groups(model: RobotModel) -> list[str]:
     """Groups of a robot's observation, in order."""
-    return list(dict.fromkeys(name.split(".")[0] for name in model.observation_table.names))
+    names = model.observation_table.names
+    return list(dict.fromkeys(name.split(".")[0] for name in names))
 
 
 def _source_names(observe: tuple[str, ...], model: RobotModel) -> list[str]:
@@ -180,9 +182,9 @@ def _source(name: str, corrected: Corrected, period_s: float) -> Any:
     features and the new memory.
     """
     model = corrected.model
-    if name in corrected.base.estimates:
-        base = corrected.base
-        return _Instant(base.estimates[name], partial(base.estimate, name), reads_base=True)
+    base = corrected.base
+    if signals := base.estimates.get(name):
+        return _Instant(signals, partial(base.estimate, name), reads_base=True)
     table = model.observation_table
     groups = _groups(model)
     if name in groups or name in table.names:
@@ -204,7 +206,7 @@ def _source(name: str, corrected: Corrected, period_s: float) -> Any:
         }
         if name in walker_sources:
             return walker_sources[name]()
-        others += [*walker_sources, *corrected.base.estimates]
+        others += [*walker_sources, *base.estimates]
     names = [OBSERVATION, BASE_ACTION, *others, *groups]
     raise unknown_name("feature of a residual", name, names)
 
@@ -258,8 +260,8 @@ class _ZmpOfSteps:
     """
 
     def __init__(self, model: WalkerModel) -> None:
-        meaning = "mean ZMP error {part} in the last step on a foot"
-        self.signals = SignalGroup.of("zmp_of_steps", "m", meaning, OF_FEET, None).signals
+        text = "mean ZMP error {part} in the last step on a foot"
+        self.signals = SignalGroup.of("zmp_of_steps", "m", text, OF_FEET, None).signals
         self._error = _zmp_error(model)
         clock = model.observation_table.group("clock")
         self._time = clock.start
@@ -292,7 +294,8 @@ def _phase(model: WalkerModel) -> _Instant:
     view = ObservationView(model)
     orders = range(1, _PHASE_HARMONICS + 1)
     parts: Any = {f"{kind}_{k}": "same" for k in orders for kind in ("cosine", "sine")}
-    signals = SignalGroup.of("phase", "1", "{part} of the phase of a step", parts, None).signals
+    text = "{part} of the phase of a step"
+    signals = SignalGroup.of("phase", "1", text, parts, None).signals
 
     def observe(rows: Array) -> Array:
         return table.take(view.plan_row(rows), axis=0, mode="clip")

@@ -45,8 +45,8 @@ class Mirror:
         others = [_other_side(name) for name in columns]
         if missing := [name for name in others if name not in columns]:
             raise ConfigurationError(
-                f"in the mirror left and right change places, but there is no {', '.join(missing)};"
-                " observe both, or mirror: false"
+                "in the mirror left and right change places, but there is no"
+                f" {', '.join(missing)}; observe both, or mirror: false"
             )
         self.source = np.array([columns[name] for name in others], dtype=np.int64)
         self.sign = np.array([_sign(signal) for signal in signals])
@@ -83,7 +83,8 @@ class LeftFirst:
         for name, input_bounds in bounds.items():
             if INPUTS[name].axes is None:
                 left, right = np.split(input_bounds, 2)
-                different += [model.joint_names[i] for i in np.flatnonzero(left != right)]
+                differ = np.flatnonzero(left != right)
+                different += [model.joint_names[i] for i in differ]
         if different:
             raise ConfigurationError(
                 "mirror needs the same joints and bounds on both legs, which differ for"

@@ -93,7 +93,8 @@ class Network:
 
     def __call__(self, features: Array) -> Array:
         """Residual in [−1, 1], (num_worlds, features) to (num_worlds, k)."""
-        x = np.clip((features - self._mean) / self._std, -self._clip, self._clip).astype(np.float32)
+        normalised = (features - self._mean) / self._std
+        x = np.clip(normalised, -self._clip, self._clip).astype(np.float32)
         for number, (W, b) in enumerate(self._layers):
             x = affine(x, W, b)
             if number < len(self._layers) - 1:

@@ -32,7 +32,7 @@ def save_residual(folder: Path, residual: Any, tensors: Tensors) -> None:
     """
     Network(residual, tensors)
     folder.mkdir(parents=True, exist_ok=True)
-    weights = save({name: np.ascontiguousarray(tensor) for name, tensor in tensors.items()})
+    weights = save({k: np.ascontiguousarray(v) for k, v in tensors.items()})
     write_whole(folder / WEIGHTS, weights)
     residual = residual.replace(weights_sha256=sha256(weights).hexdigest())
     write_whole(folder / DESCRIPTION, residual.model_dump_json(indent=2) + "\n")

@@ -65,13 +65,15 @@ class ResidualPolicy(BatchPolicy):
         n = len(rows)
         wait = np.full(n, _UNDECIDED)
         residual = np.zeros((n, self.corrected.num_residuals))
-        return ResidualMemory(wait, residual, self.features.begin(n), self.corrected.begin(rows))
+        features = self.features.begin(n)
+        return ResidualMemory(wait, residual, features, self.corrected.begin(rows))
 
     @override
     def act(self, rows: Array, memory: ResidualMemory, inputs: PolicyInputs) -> Step:
         due = memory.wait <= 0
         if np.count_nonzero(due) > 0:
-            memory = put_rows(memory, due, select_rows(self._decide(rows, memory, due), due))
+            decided = select_rows(self._decide(rows, memory, due), due)
+            memory = put_rows(memory, due, decided)
         action, inner = self.corrected.correct(rows, memory.residual, memory.inner, inputs)
         return action, memory._replace(wait=memory.wait - 1, inner=inner)
 
@@ -82,11 +84,12 @@ class ResidualPolicy(BatchPolicy):
     def _decide(self, rows: Array, memory: ResidualMemory, due: BoolArray) -> Any:
         """Memory after a decision of the worlds that are due."""
         is_first = memory.wait == _UNDECIDED
-        values, features = self.features.at(rows, memory.features, is_first, memory.inner, None)
+        inner = memory.inner
+        values, features = self.features.at(rows, memory.features, is_first, inner, None)
         residual = memory.residual.copy()
         residual[due] = self.features.turn_back(rows[due], self._network(values[due]))
         wait = np.full_like(memory.wait, self._period)
-        return ResidualMemory(wait, residual, features, memory.inner)
+        return ResidualMemory(wait, residual, features, inner)
 
 
 _UNDECIDED = -1

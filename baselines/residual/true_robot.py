@@ -53,9 +53,9 @@ def true_robot(
     """
     if truth is None or not isinstance(model, WalkerModel):
         raise ConfigurationError(
-            f"a teacher sees the true {', '.join(names)}, which only the simulation of a walker"
-            " knows: it is no residual for a robot; train one with privileged: [], and"
-            " critic_sees: [] where there is no such truth"
+            f"a teacher sees the true {', '.join(names)}, which only the simulation of"
+            " a walker knows: it is no residual for a robot; train one with"
+            " privileged: [], and critic_sees: [] where there is no such truth"
         )
     signals: list[Signal] = []
     for name in names:

@@ -146,12 +146,11 @@ def follow_com(
             before = com - last.planned[i]
             deviation = shifted + planned.soles[support, i] - planned.com[i]
             velocity = (shifted - before) / constants.period_s - planned.com_dot[i]
-            change_of_velocity = velocity - last.velocity[i]
-            memory.velocity[i] = last.velocity[i] + constants.velocity_share * change_of_velocity
+            velocity_step = velocity - last.velocity[i]
+            memory.velocity[i] = last.velocity[i] + constants.velocity_share * velocity_step
             error = deviation + memory.velocity[i] / constants.omega
             gain = (1.0 + change) * constants.dcm
-            wanted = within(gain * error, constants.zmp_limit_m)
-            missing = wanted - last.shift[i]
+            missing = within(gain * error, constants.zmp_limit_m) - last.shift[i]
             memory.shift[i] = last.shift[i] + constants.zmp_share * missing
 
 
@@ -173,12 +172,13 @@ def offset_leg(
     first = 6 * leg
     sign = 1.0 - 2.0 * leg
     difference = memory.difference + added.leg_length
-    hip, knee, ankle = lengthening(constants, obs.reference_angle[first + 3], difference, sign)
+    knee_angle = obs.reference_angle[first + 3]
+    hip, knee, ankle = lengthening(constants, knee_angle, difference, sign)
     share = obs.load_share if leg == 1 else 1.0 - obs.load_share
     load = share * constants.weight
     cosine = planned.foot_yaw[leg, 0]
     sine = planned.foot_yaw[leg, 1]
-    forward = cosine * memory.shift[0] + sine * memory.shift[1]  # in the frame of the foot
+    forward = cosine * memory.shift[0] + sine * memory.shift[1]  # in the foot's frame
     left = cosine * memory.shift[1] - sine * memory.shift[0]
     pitch = load * forward / constants.ankle_stiffness[leg, 0]
     roll = -load * left / constants.ankle_stiffness[leg, 1]

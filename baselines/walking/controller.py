@@ -30,8 +30,9 @@ import numpy as np
 from typing_extensions import override
 
 from baselines.compensation.contact_torque import cosine_and_sine, planned_feet, shifted_shares
+from baselines.compensation.filters import filter_share
 from baselines.compensation.observation_view import WalkView
-from baselines.compensation.policy import BatchPolicy, PolicyInputs, Step, filter_share
+from baselines.compensation.policy import BatchPolicy, PolicyInputs, Step
 from baselines.compensation.records import Records, record_row, record_rows
 from baselines.compensation.startup import feedback_ramp
 from baselines.walking.control_kernel import INPUTS, MEMORY, control
@@ -95,7 +96,7 @@ def _sole_center(biped: Biped) -> Array:
     return np.array([0.0, 0.0, -biped.ankle_height])
 
 
-_KERNEL_GAINS = [name for name in WalkingGains.model_fields if not name.endswith("filter_s")]
+_KERNEL_GAINS = [f for f in WalkingGains.model_fields if not f.endswith("filter_s")]
 
 
 class WalkingController(BatchPolicy):
@@ -157,7 +158,8 @@ class WalkingController(BatchPolicy):
         """Act for a control step; an input `deflection` r winds the springs by 1 + r as much."""
         observations = self._walk_view.fields(rows)
         theta = rows[:, self._theta]
-        com, soles = self._biped.chains.com_and_feet(theta, self._sole, rows[:, self._attitude])
+        attitude = rows[:, self._attitude]
+        com, soles = self._biped.chains.com_and_feet(theta, self._sole, attitude)
         shares = _NO_SHARES
         if (shift := inputs.zmp_shift) is not None:
             shares = np.empty(len(rows))

@@ -29,14 +29,9 @@ from typing import Any
 import numpy as np
 from typing_extensions import override
 
+from baselines.compensation.filters import filter_share
 from baselines.compensation.observation_view import WalkView
-from baselines.compensation.policy import (
-    MemoryAround,
-    PolicyAround,
-    PolicyInputs,
-    Step,
-    filter_share,
-)
+from baselines.compensation.policy import MemoryAround, PolicyAround, PolicyInputs, Step
 from baselines.compensation.records import record_row, record_rows
 from baselines.compensation.startup import feedback_ramp
 from baselines.walking.flat_feet import LEAST_LOAD, FlatFeet
@@ -111,10 +106,10 @@ class DcmObserver(PolicyAround):
         zmp = shift if inputs.zmp is None else inputs.zmp + shift
         action, inner = self.policy.act(rows, memory.inner, inputs._replace(zmp=zmp))
         links = self.policy.link_angles(rows, inner)
-        com_and_soles = self._chains.com_and_feet(links, self._sole, rows[:, self._attitude])
+        points = self._chains.com_and_feet(links, self._sole, rows[:, self._attitude])
         error = np.nan_to_num(self._feet.zmp_error(rows), nan=0.0) - shift
         observations = self._walk_view.fields(rows)
-        observe(self._constants, observations, self._plan, *com_and_soles, error, estimate)
+        observe(self._constants, observations, self._plan, *points, error, estimate)
         return action, MemoryAround(estimate, inner)
 
 
@@ -130,10 +125,10 @@ def cancel_disturbance(constants: Any, ramp: Array, memory: Any, shift: Array) -
     """
     limit = constants[0].limit_m
     for world in range(len(memory)):
-        estimate = memory[world]
-        share = ramp[int(min(estimate.steps, len(ramp) - 1.0))]
+        state = memory[world]
+        share = ramp[int(min(state.steps, len(ramp) - 1.0))]
         for i in range(2):
-            shift[world, i] = -share * min(max(estimate.disturbance[i], -limit), limit)
+            shift[world, i] = -share * min(max(state.disturbance[i], -limit), limit)
 
 
 @compiled
@@ -159,26 +154,25 @@ def observe(
     """
     known = constants[0]
     for world in range(len(memory)):
-        estimate = memory[world]
+        state = memory[world]
         obs = observations[world]
         right = obs.load_share
         periods = np.rint(obs.clock[0] / known.period_s)
-        row = int(min(max(periods - 1.0, 0.0), len(plan) - 1.0))
-        planned = plan[row]
+        planned = plan[int(min(max(periods - 1.0, 0.0), len(plan) - 1.0))]
         for i in range(2):
             on_left = com[world, i] - soles[world, 0, i] + planned.soles[0, i]
             on_right = com[world, i] - soles[world, 1, i] + planned.soles[1, i]
             ahead = (1.0 - right) * on_left + right * on_right - planned.com[i]
-            if estimate.steps == 0.0:
-                estimate.com[i] = ahead
-                estimate.dcm[i] = ahead
-                estimate.zmp[i] = zmp_error[world, i]
-            step = known.smooth_share * (ahead - estimate.com[i])
-            estimate.com[i] += step
-            estimate.zmp[i] += known.smooth_share * (zmp_error[world, i] - estimate.zmp[i])
-            dcm = estimate.com[i] + step / (known.period_s * known.omega)
-            rate = (dcm - estimate.dcm[i]) / known.period_s
-            estimate.dcm[i] = dcm
-            missing = estimate.zmp[i] + rate / known.omega - estimate.disturbance[i]
-            estimate.disturbance[i] += known.follow_share * missing
-        estimate.steps += 1.0
+            if state.steps == 0.0:
+                state.com[i] = ahead
+                state.dcm[i] = ahead
+                state.zmp[i] = zmp_error[world, i]
+            step = known.smooth_share * (ahead - state.com[i])
+            state.com[i] += step
+            state.zmp[i] += known.smooth_share * (zmp_error[world, i] - state.zmp[i])
+            dcm = state.com[i] + step / (known.period_s * known.omega)
+            rate = (dcm - state.dcm[i]) / known.period_s
+            state.dcm[i] = dcm
+            missing = state.zmp[i] + rate / known.omega - state.disturbance[i]
+            state.disturbance[i] += known.follow_share * missing
+        state.steps += 1.0

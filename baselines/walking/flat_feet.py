@@ -64,7 +64,8 @@ class FlatFeet:
         force = np.empty((len(rows), 2, 3))
         error = np.empty((len(rows), 2))
         wrenches = np.ascontiguousarray(wrench).reshape(-1, 2, 2, 3)
-        ground_reaction(self._feet, self._plan, self._view.fields(rows), wrenches, force, error)
+        observations = self._view.fields(rows)
+        ground_reaction(self._feet, self._plan, observations, wrenches, force, error)
         return force, error
 
 
@@ -72,7 +73,7 @@ class FlatFeet:
 def ground_reaction(
     feet: Any, plan: Any, observations: Any, wrench: Array, force: Array, error: Array
 ) -> None:
-    """Fill in the values of `FlatFeet.ground`, as `compute_zmp` in the control kernels.
+    """Fill in the values of `FlatFeet.ground`, by the equation of `compute_zmp`.
 
     Args:
         feet: Feet of the walker, a row, (1,).

@@ -32,7 +32,7 @@ class FootTareGains(Model):
     first_gain: float = quantity("1", 1.0, ge=0, le=1)
     """Share of the first mean that is subtracted [1]."""
     gain: float = quantity("1", 0.5, ge=0, le=1)
-    """Share of the remaining mean in every further swing [1]."""
+    """Share of the rest that is subtracted in every further swing [1]."""
 
 
 TARE = record_type(
@@ -84,36 +84,36 @@ def unloaded_wrench(model: WalkerModel) -> Array:
 
 
 @compiled
-def tare_feet(gains: Any, unloaded: Array, observations: Any, memory: Any) -> None:
+def tare_feet(settings: Any, unloaded: Array, observations: Any, memory: Any) -> None:
     """Subtract the bias from the wrenches of observations, in place, and update the memory.
 
     Args:
-        gains: Gains and the control period, a row, (1,).
+        settings: Gains and the control period, a row, (1,).
         unloaded: Result of `unloaded_wrench`.
         observations: Rows with fields, (n,).
         memory: Rows of `TARE`, to be updated, (n,).
     """
-    settings = gains[0]
+    gains = settings[0]
     for world in range(len(memory)):
         obs = observations[world]
         tare = memory[world]
         foot = 1 - int(obs.clock[2])
         progress = obs.clock[1]
-        if settings.begin < progress < 1.0 - settings.begin:
+        if gains.begin < progress < 1.0 - gains.begin:
             # measured at the end of the last period
-            row = int(np.rint(obs.clock[0] / settings.period_s)) - 1
+            row = int(np.rint(obs.clock[0] / gains.period_s)) - 1
             expected = unloaded[min(max(row, 0), len(unloaded) - 1), foot]
             for part in range(2):
                 for i in range(3):
                     tare.total[part, i] += obs.wrench[foot, part, i] - expected[part, i]
             tare.samples += 1.0
         elif tare.samples > 0.0:
-            share = settings.gain if tare.swings[foot] > 0.0 else settings.first_gain
+            gain = gains.gain if tare.swings[foot] > 0.0 else gains.first_gain
             tare.swings[foot] += 1.0
             for part in range(2):
                 for i in range(3):
                     mean = tare.total[part, i] / tare.samples
-                    tare.bias[foot, part, i] += share * (mean - tare.bias[foot, part, i])
+                    tare.bias[foot, part, i] += gain * (mean - tare.bias[foot, part, i])
                     tare.total[part, i] = 0.0
             tare.samples = 0.0
         for side in range(2):

@@ -138,7 +138,8 @@ class FootholdCorrection(PolicyAround):
         plan_rows: IntArray = np.empty(len(rows), dtype=np.int64)
         correct_footholds(self._gains, self._plan, observations, footholds, plan_rows)
         total = action.astype(np.float64)
-        move_feet(*self._stances, plan_rows, np.ascontiguousarray(footholds["offset"]), total)
+        offset = np.ascontiguousarray(footholds["offset"])
+        move_feet(*self._stances, plan_rows, offset, total)
         return total.astype(np.float32), MemoryAround(footholds, inner)
 
 
@@ -175,8 +176,8 @@ def correct_footholds(
         else:
             foothold.swing = -1.0
             add_landing_error(gains, planned, obs, foothold)
-            load_elsewhere = obs.load_share if foot == 0 else 1.0 - obs.load_share
-            share = max((load_elsewhere - (1.0 - gains.return_load)) / gains.return_load, 0.0)
+            other_load = obs.load_share if foot == 0 else 1.0 - obs.load_share
+            share = max((other_load - (1.0 - gains.return_load)) / gains.return_load, 0.0)
         for i in range(2):
             foothold.offset[1 - foot, i] = 0.0
             foothold.offset[foot, i] = share * foothold.target[foot, i]

@@ -60,8 +60,8 @@ class PhaseTable(Model):
         """Inputs at stride angles, (n,) [rad] to (n, 4), columns as in `CHANNELS`."""
         columns = []
         for channel, is_odd in zip(CHANNELS, _IS_ODD, strict=True):
-            coefficients = np.array(getattr(self, channel))
-            columns.append(harmonics(psi, len(coefficients), is_odd) @ coefficients.ravel())
+            factors = np.array(getattr(self, channel))
+            columns.append(harmonics(psi, len(factors), is_odd) @ factors.ravel())
         return np.stack(columns, axis=1)
 
 
@@ -108,9 +108,9 @@ def load_phase_table(step_period_s: float, file: Path | None = None) -> PhaseTab
         periods = ", ".join(f"{period:g}" for period in sorted(shipped))
         has = f"those for step periods of {periods} s" if periods else "none"
         raise ConfigurationError(
-            f"phase_table needs a table for the step period of the gait, {step_period_s:g} s; the"
-            f" package has {has}; find one by `python -m train.learn.phase_table` and name its file"
-            " in the option phase_table"
+            "phase_table needs a table for the step period of the gait,"
+            f" {step_period_s:g} s; the package has {has}; find one by"
+            " `python -m train.learn.phase_table` and name its file in the option phase_table"
         )
 
     def missing(why: str) -> str:
@@ -145,7 +145,8 @@ class PhaseFeedforward(PassingMemory):
         fade_in = (timing.time - begin) / gait.double_support_s
         fade_out = (end - timing.time) / gait.last_double_support_s
         share = minimum_jerk(np.clip(np.minimum(fade_in, fade_out), 0.0, 1.0))
-        self._inputs = share[:, None] * table.values(stride_angle(timing, gait.step_period_s))
+        psi = stride_angle(timing, gait.step_period_s)
+        self._inputs = share[:, None] * table.values(psi)
 
     @override
     def act(self, rows: Array, memory: Any, inputs: PolicyInputs) -> Step:

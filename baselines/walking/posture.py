@@ -27,14 +27,9 @@ from typing import Any
 import numpy as np
 from typing_extensions import override
 
+from baselines.compensation.filters import filter_share
 from baselines.compensation.observation_view import WalkView
-from baselines.compensation.policy import (
-    MemoryAround,
-    PolicyAround,
-    PolicyInputs,
-    Step,
-    filter_share,
-)
+from baselines.compensation.policy import MemoryAround, PolicyAround, PolicyInputs, Step
 from baselines.compensation.records import record_row
 from baselines.compensation.startup import Ramp
 from elastic_env.core.compiled import compiled, compiled_part, record_type
@@ -119,8 +114,8 @@ class PostureFeedback(PolicyAround):
         action, inner = self.policy.act(rows, memory.inner, inputs)
         total = action.astype(np.float64)
         after = np.empty(len(rows), FEEDBACK)
-        observations = self._walk_view.fields(rows)
-        add_feedback(self.gains, observations, self.ramp, change, memory.own, after, total)
+        fields = self._walk_view.fields(rows)
+        add_feedback(self.gains, fields, self.ramp, change, memory.own, after, total)
         return total.astype(np.float32), MemoryAround(after, inner)
 
 
@@ -190,11 +185,11 @@ def pitch_of_leg(gains: Any, right: Any, leg: int, turn: float, last: Any, memor
 
     A leg that carries half of the weight turns at once, a leg in the air follows slowly.
     """
-    share = right if leg == 1 else 1.0 - right
-    standing = min(2.0 * share, 1.0)
+    standing = min(2.0 * (right if leg == 1 else 1.0 - right), 1.0)
     following = gains.swing_share if standing < 1.0 else 1.0
-    memory.leg_pitch[leg] = last.leg_pitch[leg] + following * (turn - last.leg_pitch[leg])
-    return last.leg_pitch[leg] + standing * (turn - last.leg_pitch[leg])
+    before = last.leg_pitch[leg]
+    memory.leg_pitch[leg] = before + following * (turn - before)
+    return before + standing * (turn - before)
 
 
 @compiled_part

@@ -120,9 +120,10 @@ class StandingEstimate(PolicyAround):
         is_at_rest = steps <= self._samples
         if np.count_nonzero(is_at_rest) > 0:
             force, error = self._feet.ground(rows, rows[:, self._wrench])
-            measured = np.hstack([np.nan_to_num(error, nan=0.0), rows[:, self._attitude]])
+            measured = np.hstack([np.nan_to_num(error), rows[:, self._attitude]])
             total = total + is_at_rest[:, None] * measured
-            load = load + is_at_rest * ((force[:, 0, 2] + force[:, 1, 2]) / self._weight - 1.0)
+            vertical = force[:, 0, 2] + force[:, 1, 2]
+            load = load + is_at_rest * (vertical / self._weight - 1.0)
         zmp = np.zeros((len(rows), 2)) if inputs.zmp is None else inputs.zmp.copy()
         gains = (self._per_total, self._constant, self._limit)
         add_prediction(gains, self._ramp, steps, total, zmp)

@@ -113,7 +113,8 @@ class StanceRoll(PassingMemory):
     def act(self, rows: Array, memory: Any, inputs: PolicyInputs) -> Step:
         _, swing, support = rows[:, self._clock].T
         action, memory = self.policy.act(rows, memory, inputs)
-        return (action + stance_roll(swing, support, self._gains)).astype(np.float32), memory
+        total = action + stance_roll(swing, support, self._gains)
+        return total.astype(np.float32), memory
 
 
 class FootBalanceGains(Model):
@@ -185,13 +186,13 @@ class FootBalance(BatchPolicy):
     @override
     def begin(self, rows: Array) -> BalanceMemory:
         steps = np.zeros((len(rows), 1), dtype=np.int64)
-        return BalanceMemory(steps, self._attitude_and_rate(rows), rows[:, self._wrench].copy())
+        return BalanceMemory(steps, self._imu_state(rows), rows[:, self._wrench].copy())
 
     @override
     def act(self, rows: Array, memory: BalanceMemory, inputs: PolicyInputs) -> Step:
         steps = memory.steps + 1
         share = self._filter_share(self._gains.imu_cutoff_hz)
-        imu = memory.imu + share * (self._attitude_and_rate(rows) - memory.imu)
+        imu = memory.imu + share * (self._imu_state(rows) - memory.imu)
         share = self._filter_share(self._gains.wrench_cutoff_hz)
         wrench = memory.wrench + share * (rows[:, self._wrench] - memory.wrench)
         q_ref = self.view.motion(rows).q
@@ -199,7 +200,7 @@ class FootBalance(BatchPolicy):
         action = self._ramp.take(steps, mode="clip") * (q - q_ref)
         return action.astype(np.float32), BalanceMemory(steps, imu, wrench)
 
-    def _attitude_and_rate(self, rows: Array) -> Array:
+    def _imu_state(self, rows: Array) -> Array:
         return np.hstack([rows[:, self._attitude], rows[:, self._rate]])
 
     def _adjustments(self, rows: Array, imu: Array, wrench: Array) -> Any:

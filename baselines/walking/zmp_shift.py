@@ -129,8 +129,8 @@ def zmp_shift_offsets(model: WalkerModel, zmp: Array) -> Array:
     offsets = np.zeros((len(zmp), len(model.joint_names)))
     plan = model.plan
     zmp_in_world = turn(zmp, plan.heading)
-    com_in_world = center_of_mass_shift(zmp_in_world, plan.omega, model.control_period_s)
-    shift = turn(com_in_world, -plan.heading)
+    com = center_of_mass_shift(zmp_in_world, plan.omega, model.control_period_s)
+    shift = turn(com, -plan.heading)
     move_pelvis(*stances, np.arange(len(zmp)), shift, offsets)
     return offsets
 
@@ -206,5 +206,5 @@ def level_leg(legs: Any, x: float, y: float, z: float) -> tuple[float, float, fl
     cosine = (distance**2 - thigh**2 - shank**2) / (2.0 * thigh * shank)
     knee = math.acos(min(max(cosine, -1.0), 1.0))
     # angle of the shank against the line of hip and ankle
-    shank_angle = math.atan2(thigh * math.sin(knee), shank + thigh * math.cos(knee))
-    return math.atan2(y, -z), shank_angle + math.atan2(-x, math.hypot(y, z)) - knee, knee
+    angle = math.atan2(thigh * math.sin(knee), shank + thigh * math.cos(knee))
+    return math.atan2(y, -z), angle + math.atan2(-x, math.hypot(y, z)) - knee, knee

@@ -9,9 +9,15 @@ from pathlib import Path
 
 from docs.pages.cells import Rows, page_table
 from elastic_env.core.errors import ConfigurationError
+from train.evaluate.change_text import (
+    BEST_ANALYTIC,
+    FEWEST_SEEDS,
+    add_sign,
+    percent,
+    percent_interval,
+)
 from train.evaluate.episodes import group_by
 from train.evaluate.statistics import Estimate
-from train.evaluate.terms import BEST_ANALYTIC, FEWEST_SEEDS, add_sign, percent, percent_interval
 
 _METRICS = {
     "pelvis_error_rms_rad": ("pelvis error", "mrad"),

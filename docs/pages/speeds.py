@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from docs.pages.cells import Rows, page_table
 from train.evaluate.episodes import group_by
-from train.evaluate.standings import Standing
+from train.evaluate.leaderboard_rows import Standing
 
 _RAW = "raw mj_step"
 _OURS = "vector env"

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import replace
 
-from train.evaluate.standings import Standing
+from train.evaluate.leaderboard_rows import Standing
 from train.report.leaderboard import leaderboard_table
 from train.report.markdown import to_markdown
 from train.report.tables import Cell, parts_of

@@ -12,8 +12,8 @@ from docs.pages.cells import (
     page_table,
 )
 from elastic_env.robots.thormang.tables import BLOCKS
+from train.evaluate.leaderboard_rows import Standing
 from train.evaluate.margins import margin_table
-from train.evaluate.standings import Standing
 
 PELVIS = "pelvis_error_rms_rad"
 ZMP = "zmp_deviation_rms_m"

@@ -34,7 +34,7 @@ from docs.pages.standings import board_markdown
 from docs.pages.step_picture import step_svg
 from elastic_env.core.errors import ConfigurationError
 from train.commands.demo import PAPER_PELVIS
-from train.evaluate.standings import Standing
+from train.evaluate.leaderboard_rows import Standing
 from train.report.leaderboard import read_leaderboard
 
 _TITLES = {"uncompensated": "without compensation", "input_output": "with the paper's compensator"}

@@ -6,7 +6,7 @@ of mass of the whole robot follows the preview control.
 Swinging legs move the ZMP away from that of the cart-table: 2.5 mm rms in steps of 3 s, 9 mm in
 steps of 1.1 s. A second pass of the preview control on the error of the ZMP [Kajita2003]
 leaves about a seventh of it. Plans of a robot that does not walk in place have this second pass. A
-policy can walk a plan with a further pass (`baselines.walking.refined_walk`).
+policy can walk a plan with a further pass (`baselines.walking.refined_plan`).
 
 The plan's world frame: x forward at the start, y left, z up, the origin on the ground halfway
 between the feet at the start. The local frame, in which policies read the plan: level, on the

@@ -27,11 +27,12 @@ from elastic_env.motion import arm_references
 from elastic_env.motion.arm_references import AnyArmReference, ArmReference, Workspace
 from elastic_env.motion.references import Multisine
 from elastic_env.registration import Robot, as_model
+from elastic_env.rendering import deviation_picture
 from elastic_env.rendering.picture import CAMERA, set_stage
 from elastic_env.rendering.side_by_side import DisplayRobot, Sides
 from elastic_env.rigid.rigid_body import RigidBody
 from elastic_env.rigid.tree.end_effector import EndEffector
-from elastic_env.robots import deviations, feasible_reference
+from elastic_env.robots import feasible_reference
 from elastic_env.world import robot_model
 from elastic_env.world.further_sensors import ACCELEROMETER, add_accelerometer
 from elastic_env.world.joint_config import FRICTIONS, JointConfig, RewardWeights
@@ -293,7 +294,7 @@ class JointRobotConfig(JointConfig):
         return self.robot.plant(self)
 
 
-class JointPicture(deviations.DeviationPicture):
+class JointPicture(deviation_picture.DeviationPicture):
     """Picture of the robot with enlarged deviations, and of the reference as a translucent robot.
 
     Args:
@@ -304,7 +305,7 @@ class JointPicture(deviations.DeviationPicture):
         assert isinstance(task.config, JointRobotConfig)
         robot = task.config.robot
         spec = robot.rigid()
-        set_stage(spec, deviations.WIDTH, deviations.HEIGHT)
+        set_stage(spec, deviation_picture.WIDTH, deviation_picture.HEIGHT)
         view = spec.copy().compile().stat
         x, y, z = view.center
         eye = [x, y - 2.4 * view.extent, z + 0.25 * view.extent]
@@ -315,9 +316,9 @@ class JointPicture(deviations.DeviationPicture):
         light.specular = [0.0] * 3
         reference = robot.rigid()
         for geom in reference.geoms:
-            geom.rgba = deviations.REFERENCE_RGBA
+            geom.rgba = deviation_picture.REFERENCE_RGBA
         spec.attach(reference, prefix=_REFERENCE, frame=spec.worldbody.add_frame())
-        legend = [("translucent: reference", deviations.REFERENCE_WORD_RGBA)]
+        legend = [("translucent: reference", deviation_picture.REFERENCE_WORD_RGBA)]
         super().__init__(spec, legend)
         self._robot = robot
         self._task = task
@@ -336,7 +337,7 @@ class JointPicture(deviations.DeviationPicture):
     def _pose(self, now: dict[str, float], world: int) -> None:  # noqa: ARG002
         joints = self._task.sample().joints["truth"][world]
         q_ref = joints["q_ref"]
-        enlarged = deviations.enlarge_deviation(joints["q"], q_ref)
+        enlarged = deviation_picture.enlarge_deviation(joints["q"], q_ref)
         for name, angle, reference in zip(self._joints, enlarged, q_ref, strict=True):
             self._data.joint(name).qpos = angle
             self._data.joint(_REFERENCE + name).qpos = reference

@@ -16,9 +16,9 @@ from typing import Any
 
 import numpy as np
 
-from elastic_env.core.robot_ranges import CROSS_TALK_ENTRIES, FOOT_ERRORS, DrawnRobot
 from elastic_env.core.signals import Array
 from elastic_env.rigid.biped import Biped
+from elastic_env.world.robot_ranges import CROSS_TALK_ENTRIES, FOOT_ERRORS, DrawnRobot
 
 _RANGE_RATIO_M = 0.04
 """Range of the moments over the range of the forces [m]: 8 N·m over 200 N for a commercial six-axis

@@ -7,11 +7,11 @@ from pydantic import Field
 
 from elastic_env.core.config import Model, Title, quantity
 from elastic_env.core.errors import ConfigurationError
-from elastic_env.core.robot_ranges import WALKER_FIELDS
 from elastic_env.core.signals import Array
 from elastic_env.joint.elasticity import ElasticJoint
 from elastic_env.motion.references import Hold, Reference
 from elastic_env.world.joint_signals import ACTION_BOUND_RAD
+from elastic_env.world.robot_ranges import WALKER_FIELDS
 from elastic_env.world.scenario import Scenario, make_scenario
 
 FRICTIONS = ("coulomb_friction", "viscous_friction", "load_friction", "static_friction")

@@ -18,7 +18,6 @@ import numpy as np
 from elastic_env.core.episode_random import EpisodeRandom
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.files import read_rows
-from elastic_env.core.robot_ranges import draw_robot, draw_robots
 from elastic_env.core.signals import Array, BoolArray, Parameter, Signal, Signals
 from elastic_env.joint.elasticity import static_link_angle
 from elastic_env.joint.time_step import require_stable
@@ -34,6 +33,7 @@ from elastic_env.world.physics import DIVERGED_RAD_S
 from elastic_env.world.records import Records, Sample, single_record
 from elastic_env.world.rest_check import RestWatch
 from elastic_env.world.robot_model import RobotModel
+from elastic_env.world.robot_ranges import draw_robot, draw_robots
 from elastic_env.world.sensors import PendulumImu, is_due
 from elastic_env.world.task import Task, spring_torque
 

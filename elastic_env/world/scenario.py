@@ -19,7 +19,7 @@ from pydantic import Field
 
 from elastic_env.core.config import Title, quantity, read_mapping
 from elastic_env.core.errors import ConfigurationError, quote, unknown_name
-from elastic_env.core.robot_ranges import LOAD_PLACE, WALKER_FIELDS, RobotRanges
+from elastic_env.world.robot_ranges import LOAD_PLACE, WALKER_FIELDS, RobotRanges
 from elastic_env.world.sensors import AttitudeSensor, InertialSensor
 
 MOST_RANGES = 100

@@ -19,7 +19,6 @@ from gymnasium.error import ResetNeeded
 from elastic_env.core.compiled import compile_now
 from elastic_env.core.episode_random import EpisodeRandom
 from elastic_env.core.errors import ActionError
-from elastic_env.core.robot_ranges import DrawnRobot
 from elastic_env.core.signals import Array, BoolArray, Signal, Signals, SignalTable
 from elastic_env.joint.elasticity import joint_torque
 from elastic_env.motion.trajectory import Motion, PlanTable
@@ -31,6 +30,7 @@ from elastic_env.world.metrics import EpisodeMetrics, Metric
 from elastic_env.world.physics import DIVERGED_RAD_S, Simulation, simulate, substeps
 from elastic_env.world.records import Records, Sample
 from elastic_env.world.robot_model import RobotModel
+from elastic_env.world.robot_ranges import DrawnRobot
 from elastic_env.world.scenario import Scenario
 from elastic_env.world.sensors import NoiseStream, angle_of_count
 from elastic_env.world.step_info import StepInfo

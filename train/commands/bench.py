@@ -40,8 +40,8 @@ from train.evaluate.statistics import Estimate
 from train.report.markdown import to_markdown
 from train.report.tables import Head, Row, Table
 from train.report.terminal import print_table
-from train.runs.annotations import annotation, runs_in_workflow
 from train.runs.folders import run_folder
+from train.runs.github_annotations import annotation, runs_in_workflow
 from train.runs.user_code import CodeNamingModel, kind_check, load_without_code
 
 DEFAULT_CONFIG = Path("configs/bench.yaml")

@@ -15,17 +15,23 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, get_args
 
 import tyro
 from rich.text import Text
+from tyro.constructors import (
+    ConstructorRegistry,
+    PrimitiveConstructorSpec,
+    PrimitiveTypeInfo,
+    UnsupportedTypeAnnotationError,
+)
 
 import elastic_env
 from elastic_env.core.config_problems import ModelError
 from elastic_env.core.errors import shorten
-from train.runs.annotations import annotation, runs_in_workflow
 from train.runs.console import PlainConsole, traceback_text, visible_warnings
 from train.runs.failures import DEFECT, SignalError, explain
+from train.runs.github_annotations import annotation, runs_in_workflow
 from train.runs.import_path import remove_from_path
 from train.runs.progress import announce_compilation
 
@@ -124,7 +130,13 @@ def _parse(arguments: list[str]) -> Any:
     messages = io.StringIO()
     try:
         with name_options(), contextlib.redirect_stderr(messages):
-            return tyro.cli(command, prog=f"elastic {name}", args=arguments[1:], config=_STYLE)
+            return tyro.cli(
+                command,
+                prog=f"elastic {name}",
+                args=arguments[1:],
+                config=_STYLE,
+                registry=_REGISTRY,
+            )
     except SystemExit as end:
         # tyro turns a wrong group of options into a box with the words of Python
         problem = end.__context__ and end.__context__.__context__
@@ -138,6 +150,28 @@ def _parse(arguments: list[str]) -> Any:
 
 
 _STYLE = (tyro.conf.OmitSubcommandPrefixes, tyro.conf.OmitArgPrefixes)
+_REGISTRY = ConstructorRegistry()
+
+
+@_REGISTRY.primitive_rule
+def _optional_rule(
+    info: PrimitiveTypeInfo,
+) -> PrimitiveConstructorSpec | UnsupportedTypeAnnotationError | None:
+    """Show an option without a default value as `--port STR`, where tyro has `{None}|STR`."""
+    kinds = get_args(info.type)
+    if type(None) not in kinds:
+        return None
+    kind = functools.reduce(operator.or_, (kind for kind in kinds if kind is not type(None)))
+    spec = ConstructorRegistry.get_primitive_spec(PrimitiveTypeInfo.make(kind, info.markers))
+    if isinstance(spec, UnsupportedTypeAnnotationError):
+        return spec
+    return dataclasses.replace(
+        spec,
+        is_instance=lambda value: value is None or spec.is_instance(value),
+        str_from_instance=lambda value: (
+            ["None"] if value is None else spec.str_from_instance(value)
+        ),
+    )
 
 
 def _parse_overview(arguments: list[str]) -> Any:

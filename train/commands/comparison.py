@@ -14,10 +14,10 @@ from train.commands.compare_config import CompareConfig
 from train.evaluate.changes import changes
 from train.evaluate.conditions import Condition
 from train.evaluate.episodes import Evaluation, merge_seeds
+from train.evaluate.leaderboard_rows import Standing, append_standings, standings
 from train.evaluate.maps import heat_maps
 from train.evaluate.robots import robot_scores
 from train.evaluate.rollout import make_policy, single_world_envs
-from train.evaluate.standings import Standing, append_standings, standings
 from train.figures import plots
 from train.figures.comparison_figures import draw_figures, draw_maps
 from train.report.change_tables import print_changes, write_maps, write_statistics

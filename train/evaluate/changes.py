@@ -12,9 +12,16 @@ import numpy as np
 import pandas as pd
 
 from elastic_env.core.signals import Array
+from train.evaluate.change_text import FEWEST_SEEDS, percent
 from train.evaluate.environments import Column
 from train.evaluate.episodes import Evaluation, group_by
-from train.evaluate.scores import EpisodesByRobot, by_episode, failures, means_of_cells, pair
+from train.evaluate.scores import (
+    EpisodesByRobot,
+    episodes_as_robots,
+    failures,
+    means_of_cells,
+    pair,
+)
 from train.evaluate.statistics import (
     Counts,
     Estimate,
@@ -24,7 +31,6 @@ from train.evaluate.statistics import (
     interquartile_mean,
 )
 from train.evaluate.table import EpisodeTable, Groups, Scope
-from train.evaluate.terms import FEWEST_SEEDS, percent
 from train.evaluate.training_marks import training_marks
 
 Verdict = Literal["lower", "higher", "none", "unclear"]
@@ -199,7 +205,7 @@ def change_of(table: EpisodeTable, scope: Scope, base: str, column: Column) -> C
     ]
     member = scope.first.member
     if member is None:
-        own_rows = by_episode(own_rows)
+        own_rows = episodes_as_robots(own_rows)
     cell_pairs = zip(table.cells_of_base(scope, base), scope.cells, strict=True)
     base_rows = pd.concat(
         [table.rows_of(base, base_cell).assign(cell=cell) for base_cell, cell in cell_pairs]

@@ -11,7 +11,7 @@ from baselines.policies import sensors_needed, track
 from elastic_env.core.config import LARGEST_SEED, Locator, Model, Title, quantity
 from elastic_env.core.config_problems import meaning_of
 from elastic_env.core.errors import ConfigurationError, quote
-from elastic_env.core.robot_ranges import RobotRanges
+from elastic_env.world.robot_ranges import RobotRanges
 from elastic_env.world.scenario import MOST_RANGES, Scenario, make_scenario
 from train.evaluate.environments import (
     ENVIRONMENTS,

@@ -26,7 +26,7 @@ from train.evaluate.conditions import (
 )
 from train.evaluate.environments import Column, Environment
 from train.evaluate.episodes import Evaluation, group_by
-from train.evaluate.scores import failures, score
+from train.evaluate.scores import best_of, failures, score
 from train.evaluate.statistics import Estimate
 from train.evaluate.table import EpisodeTable
 
@@ -217,29 +217,6 @@ def heat_maps(evaluations: Sequence[Evaluation], config: MapConfig) -> list[Heat
         for title, group in group_by(evaluations, title_of).items()
         for heat_map in _heat_maps(title, EpisodeTable(group), config)
     ]
-
-
-Scores = Mapping[str, tuple[Estimate, tuple[int, int]]]
-"""Score of every policy, with the number of its failed episodes and of all its episodes."""
-
-
-def ranking(scores: Scores) -> list[str]:
-    """The policies that have a score, the best first: fewer failures, then the lower score.
-
-    Failures count first. The score is a mean over episodes that did not fail, so it would favour a
-    policy that fails in the hard ones.
-    """
-
-    def rank(title: str) -> tuple[float, float]:
-        estimate, (failed, played) = scores[title]
-        return failed / max(played, 1), estimate.value
-
-    return sorted((title for title in scores if scores[title][0].is_known), key=rank)
-
-
-def best_of(scores: Scores) -> str | None:
-    """The best policy of a `ranking`; None if no policy has a score."""
-    return next(iter(ranking(scores)), None)
 
 
 def _heat_maps(title: str, table: EpisodeTable, config: MapConfig) -> list[HeatMap]:

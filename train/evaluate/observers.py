@@ -10,7 +10,7 @@ from baselines.identification.static_points import HoldRecorder
 from elastic_env.core.signals import Array, BoolArray
 from elastic_env.world.robot_model import WalkerModel
 from train.evaluate.environments import Environment
-from train.evaluate.support_changes import SupportChanges
+from train.evaluate.local_frame_error import SupportChanges
 
 
 class Observers:

@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from baselines.catalogue import ASSUMED_OPTIONS
 from baselines.policies import RESIDUAL, best_analytic
+from baselines.policy_options import ASSUMED_OPTIONS
 from baselines.residual.residual_folder import DESCRIPTION, read_description
 from baselines.residual.settings import ResidualDescription
 from elastic_env.core.errors import ConfigurationError, shorten

@@ -1,6 +1,6 @@
-"""Scores of policies from rows of the episode table: means over robots and cells, and pairs."""
+"""Scores of policies from rows of the episode table: means over robots and cells, pairs, ranks."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal
 
 import numpy as np
@@ -73,7 +73,7 @@ def per_robot(rows: pd.DataFrame, metric: str) -> list[Array]:
     return EpisodesByRobot(rows).figures(metric)
 
 
-def by_episode(rows: pd.DataFrame) -> pd.DataFrame:
+def episodes_as_robots(rows: pd.DataFrame) -> pd.DataFrame:
     """Return rows in which each random episode of an undrawn robot counts as a robot of its own.
 
     Its seed is the name of the robot. Statistics of policies without training use these rows.
@@ -170,3 +170,26 @@ def pair(mine: pd.DataFrame, base: pd.DataFrame, metric: str) -> pd.DataFrame:
 def failures(rows: pd.DataFrame) -> tuple[int, int]:
     """Number of episodes that failed, and of all episodes."""
     return int(rows["failed"].to_numpy().sum()), len(rows)
+
+
+Scores = Mapping[str, tuple[Estimate, tuple[int, int]]]
+"""Score of every policy, with the number of its failed episodes and of all its episodes."""
+
+
+def ranking(scores: Scores) -> list[str]:
+    """The policies that have a score, the best first: fewer failures, then the lower score.
+
+    Failures count first. The score is a mean over episodes that did not fail, so it would favour a
+    policy that fails in the hard ones.
+    """
+
+    def rank(title: str) -> tuple[float, float]:
+        estimate, (failed, played) = scores[title]
+        return failed / max(played, 1), estimate.value
+
+    return sorted((title for title in scores if scores[title][0].is_known), key=rank)
+
+
+def best_of(scores: Scores) -> str | None:
+    """The best policy of a `ranking`; None if no policy has a score."""
+    return next(iter(ranking(scores)), None)

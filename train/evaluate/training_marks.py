@@ -4,10 +4,10 @@ from collections.abc import Sequence
 from typing import Any
 
 from elastic_env.world.scenario import make_scenario
+from train.evaluate.change_text import CEILING, HELD_OUT, PARTLY, SAME_ROBOT
 from train.evaluate.conditions import Condition
 from train.evaluate.environments import Environment
 from train.evaluate.residual_seeds import Origin
-from train.evaluate.terms import CEILING, HELD_OUT, PARTLY, SAME_ROBOT
 
 
 def training_marks(origin: Origin | None, conditions: Sequence[Condition]) -> tuple[str, ...]:

@@ -19,20 +19,7 @@ from baselines.compensation.position_compensator import CompensatorConstants
 from elastic_env.core.errors import ElasticError
 from elastic_env.core.rotations import matrix_of
 from elastic_env.core.signals import Array
-from train.export.c_text import (
-    GENERATED,
-    comment,
-    enum_lines,
-    fill_template,
-    identifier,
-    member_values,
-    number,
-    number_list,
-    numbers,
-    plain_text,
-    row_lines,
-    unique_names,
-)
+from train.export import c_text
 
 _TEST_STEPS = 12
 _LOADED_STEP = 6
@@ -82,16 +69,16 @@ def c_header(
     tables = _tables(constants, frames)
     digest = sha256("\n".join(tables.values()).encode()).hexdigest()
     capitals = prefix.upper()
-    return fill_template(
+    return c_text.fill_template(
         "arm.h.in",
         prefix,
         **tables,
-        vectors=fill_template("common_vectors.h.in", prefix),
+        vectors=c_text.fill_template("common_vectors.h.in", prefix),
         digest=digest,
-        origin=comment(_origin_lines(sources or {})),
-        joints=comment(_joint_lines(names, constants)),
-        joint_names=enum_lines(unique_names(f"{capitals}_JOINT_", names)),
-        frame_names=enum_lines(f"{capitals}_{frame.name}" for frame in frames),
+        origin=c_text.comment(_origin_lines(sources or {})),
+        joints=c_text.comment(_joint_lines(names, constants)),
+        joint_names=c_text.enum_lines(c_text.unique_names(f"{capitals}_JOINT_", names)),
+        frame_names=c_text.enum_lines(f"{capitals}_{frame.name}" for frame in frames),
         test=_test_vector(compensator, prefix),
     )
 
@@ -102,17 +89,18 @@ def payload_frames(constants: CompensatorConstants) -> list[Frame]:
     tree = constants.body.tree
     bodies = [b for b in range(model.nbody) if tree.carrier[b] > 0]
     body_names = {model.body(b).name: b for b in bodies if model.body(b).name}
+    origin = (np.zeros(3), np.eye(3))
     candidates: list[tuple[str, int, Array, Array]] = [
-        ("TIP", constants.tip, np.zeros(3), np.eye(3)),
-        *((f"BODY_{identifier(n)}", b, np.zeros(3), np.eye(3)) for n, b in body_names.items()),
+        ("TIP", constants.tip, *origin),
+        *((f"BODY_{c_text.identifier(n)}", b, *origin) for n, b in body_names.items()),
     ]
     for i in range(model.nsite):
         site = model.site(i)
         body = int(site.bodyid[0])
         if body in bodies and site.name and site.name not in body_names:
-            name = f"SITE_{identifier(site.name)}"
+            name = f"SITE_{c_text.identifier(site.name)}"
             candidates.append((name, body, site.pos, matrix_of(site.quat)))
-    names = unique_names("", [name for name, *_ in candidates])
+    names = c_text.unique_names("", [name for name, *_ in candidates])
     frames: list[Frame] = []
     for name, (_, body, place, R) in zip(names, candidates, strict=True):
         R_lb = tree.R[body]
@@ -140,28 +128,28 @@ def _tables(constants: CompensatorConstants, frames: Sequence[Frame]) -> dict[st
         "num_frames": str(len(frames)),
         "ramp_steps": str(constants.ramp_steps),
         "has_friction": str(int(constants.friction is not None)),
-        "limit_rad": number(constants.limit_rad),
-        "period_s": number(constants.period_s),
-        "presliding_rad": number(PRESLIDING_RAD),
+        "limit_rad": c_text.number(constants.limit_rad),
+        "period_s": c_text.number(constants.period_s),
+        "presliding_rad": c_text.number(PRESLIDING_RAD),
         "links": ",\n".join(map(_link_text, body.tree.links[1:])),
         "frames": ",\n".join(
-            f"    {{{f.body}, {f.link}, {number_list(f.place)}, {number_list(f.R)}}}"
+            f"    {{{f.body}, {f.link}, {c_text.number_list(f.place)}, {c_text.number_list(f.R)}}}"
             for f in frames
         ),
-        **{name: numbers(values) for name, values in rows.items()},
+        **{name: c_text.numbers(values) for name, values in rows.items()},
     }
 
 
 def _link_text(row: Any) -> str:
-    masses = member_values(row, "mass mass_moment inertia weight weight_moment")
-    place = f"{row['parent']}, {row['column']}, {member_values(row, 'zero R anchor')}"
+    masses = c_text.member_text(row, "mass mass_moment inertia weight weight_moment")
+    place = f"{row['parent']}, {row['column']}, {c_text.member_text(row, 'zero R anchor')}"
     return f"    {{{place},\n     {{{masses}}}}}"
 
 
 def _origin_lines(sources: Mapping[str, bytes]) -> Iterator[str]:
-    yield GENERATED
+    yield c_text.GENERATED
     for name, content in sources.items():
-        yield f"  {plain_text(name)}, SHA-256 {sha256(content).hexdigest()}"
+        yield f"  {c_text.plain_text(name)}, SHA-256 {sha256(content).hexdigest()}"
 
 
 def _joint_lines(names: Sequence[str], constants: CompensatorConstants) -> Iterator[str]:
@@ -171,7 +159,7 @@ def _joint_lines(names: Sequence[str], constants: CompensatorConstants) -> Itera
     for j, name in enumerate(names):
         bounds = f"{constants.lowest[j]:.4g} to {constants.highest[j]:.4g} rad"
         servo = "" if np.isinf(gain[j]) else f", k_p {gain[j]:.6g} N*m/rad"
-        yield f"  {j}  {plain_text(name)}: K {K[j]:.6g} N*m/rad{servo}, {bounds}"
+        yield f"  {j}  {c_text.plain_text(name)}: K {K[j]:.6g} N*m/rad{servo}, {bounds}"
 
 
 def _test_vector(compensator: PositionCompensator, prefix: str) -> str:
@@ -187,15 +175,15 @@ def _test_vector(compensator: PositionCompensator, prefix: str) -> str:
         warnings.simplefilter("ignore")  # no robot goes to these poses
         command, link_angle = _play(compensator, q, rates)
     motion = np.stack([q, *rates], axis=1)
-    return fill_template(
+    return c_text.fill_template(
         "arm_test.h.in",
         prefix,
         steps=_TEST_STEPS,
         loaded=_LOADED_STEP,
-        payload=numbers((_PAYLOAD_KG, *_PAYLOAD_AT)),
-        motion=row_lines(motion),
-        command=row_lines(command),
-        link_angle=row_lines(link_angle),
+        payload=c_text.numbers((_PAYLOAD_KG, *_PAYLOAD_AT)),
+        motion=c_text.row_lines(motion),
+        command=c_text.row_lines(command),
+        link_angle=c_text.row_lines(link_angle),
     )
 
 

@@ -7,18 +7,7 @@ import numpy as np
 
 from baselines.residual.mirror import Mirror
 from elastic_env.core.signals import Array
-from train.export.c_text import (
-    GENERATED,
-    comment,
-    enum_lines,
-    fill_template,
-    number,
-    number_list,
-    numbers,
-    plain_text,
-    row_lines,
-    unique_names,
-)
+from train.export import c_text
 from train.export.residual_layout import ResidualLayout
 
 _TEST_ROWS = 16
@@ -42,26 +31,26 @@ def c_residual(layout: ResidualLayout, prefix: str) -> str:
     feature_mirror, residual_mirror = layout.mirrors or (None, None)
     samples = layout.draw(_TEST_ROWS)
     decided, _ = layout.decide(**samples)
-    return fill_template(
+    return c_text.fill_template(
         "residual.h.in",
         prefix,
         weights_sha256=layout.weights_sha256,
-        origin=comment(_origin_lines(facts)),
-        features=comment(_column_lines(facts["features"])),
-        columns=comment(_column_lines(facts["correction"])),
-        control_period_s=number(layout.control_period_s),
+        origin=c_text.comment(_origin_lines(facts)),
+        features=c_text.comment(_column_lines(facts["features"])),
+        columns=c_text.comment(_column_lines(facts["correction"])),
+        control_period_s=c_text.number(layout.control_period_s),
         num_features=len(layout.features),
         num_residuals=len(layout.residual),
         num_columns=len(layout.columns),
         widest=max(len(layout.features), *widths),
         decision_period=settings.decision_period,
         has_mirror=int(layout.mirrors is not None),
-        column_names=enum_lines(
-            unique_names(f"{prefix.upper()}_", [signal.name for signal in layout.columns])
+        column_names=c_text.enum_lines(
+            c_text.unique_names(f"{prefix.upper()}_", [s.name for s in layout.columns])
         ),
-        mean=numbers(layout.tensors["mean"].astype(np.float64)),
-        std=numbers(layout.tensors["std"].astype(np.float64)),
-        bounds=numbers(layout.bounds),
+        mean=c_text.numbers(layout.tensors["mean"].astype(np.float64)),
+        std=c_text.numbers(layout.tensors["std"].astype(np.float64)),
+        bounds=c_text.numbers(layout.bounds),
         source=", ".join(map(str, layout.source)),
         of_features=_mirror_rows(feature_mirror, len(layout.features)),
         of_residual=_mirror_rows(residual_mirror, len(layout.residual)),
@@ -69,19 +58,19 @@ def c_residual(layout: ResidualLayout, prefix: str) -> str:
         calls="\n".join(_layer_calls(layout, prefix, widths)),
         activation=_ACTIVATIONS[layout.description.activation],
         output=_output_expression(layout, prefix),
-        clip=number(layout.description.clip),
-        share=number(facts["share_per_control_step"]),
+        clip=c_text.number(layout.description.clip),
+        share=c_text.number(facts["share_per_control_step"]),
         rows=_TEST_ROWS,
-        test_features=row_lines(samples["features"]),
-        test_foot=numbers(samples["on_right"]),
-        test_decided=row_lines(decided),
+        test_features=c_text.row_lines(samples["features"]),
+        test_foot=c_text.numbers(samples["on_right"]),
+        test_decided=c_text.row_lines(decided),
     )
 
 
 def _origin_lines(facts: dict[str, Any]) -> Iterator[str]:
-    yield GENERATED
-    joints = ", ".join(map(plain_text, facts["joints"])) or "those of the robot"
-    name, base, robot = (plain_text(facts[key]) for key in ("name", "base", "robot"))
+    yield c_text.GENERATED
+    joints = ", ".join(map(c_text.plain_text, facts["joints"])) or "those of the robot"
+    name, base, robot = (c_text.plain_text(facts[key]) for key in ("name", "base", "robot"))
     yield f"  {name}, on {base} of the {robot}"
     yield f"  joints: {joints}"
 
@@ -89,8 +78,8 @@ def _origin_lines(facts: dict[str, Any]) -> Iterator[str]:
 def _column_lines(columns: list[dict[str, Any]]) -> Iterator[str]:
     for index, column in enumerate(columns):
         bound = f", within {column['bound']:g}" if "bound" in column else ""
-        unit = plain_text(column["unit"].replace("·", " ").replace("²", "^2"))
-        yield f"  {index:3}  {plain_text(column['name'])} [{unit}]{bound}"
+        unit = c_text.plain_text(column["unit"].replace("·", " ").replace("²", "^2"))
+        yield f"  {index:3}  {c_text.plain_text(column['name'])} [{unit}]{bound}"
 
 
 def _mirror_rows(mirror: Mirror | None, count: int) -> str:
@@ -99,7 +88,8 @@ def _mirror_rows(mirror: Mirror | None, count: int) -> str:
         return ", ".join(["{0, 1.0, 0.0}"] * count)
     rows = zip(mirror.source, mirror.sign, mirror.offset, strict=True)
     return ", ".join(
-        f"{{{source}, {number(sign)}, {number(offset)}}}" for source, sign, offset in rows
+        f"{{{source}, {c_text.number(sign)}, {c_text.number(offset)}}}"
+        for source, sign, offset in rows
     )
 
 
@@ -108,9 +98,9 @@ def _layer_tables(layout: ResidualLayout, prefix: str) -> Iterator[str]:
     for i in range(layout.num_layers):
         W: Array = np.ascontiguousarray(layout.tensors[f"weight{i}"].astype(np.float32).T)
         bias: Array = layout.tensors[f"bias{i}"].astype(np.float32)
-        rows = ",\n".join(f"    {numbers(row)}" for row in W)
+        rows = ",\n".join(f"    {c_text.numbers(row)}" for row in W)
         yield f"static const float {prefix}_weight{i}_[{W.size}] = {{\n{rows}\n}};"
-        yield f"static const float {prefix}_bias{i}_[{bias.size}] = {number_list(bias)};"
+        yield f"static const float {prefix}_bias{i}_[{bias.size}] = {c_text.number_list(bias)};"
 
 
 def _layer_calls(layout: ResidualLayout, prefix: str, widths: list[int]) -> Iterator[str]:

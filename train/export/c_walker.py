@@ -14,29 +14,18 @@ import numpy as np
 from baselines.adaptation.estimators import ASSUMED_LOADS
 from baselines.compensation.compensated import Compensated
 from baselines.compensation.contact_torque import ContactGravity
-from baselines.estimation.bending import DISAGREEMENT_RAD, LOADED_SHARE, MODEL_ERROR, OFFSET_RAD
+from baselines.estimation import model_error
 from elastic_env.core.signals import Array
 from elastic_env.world.robot_model import WalkerModel
-from train.export.c_text import (
-    GENERATED,
-    comment,
-    fill_template,
-    initialiser,
-    member_values,
-    number,
-    number_list,
-    numbers,
-    plain_text,
-    row_lines,
-)
+from train.export import c_text
 from train.export.walker_layers import WalkerLayers, find_layers
 from train.export.walker_vectors import play_steps
 
 _TEST_STEPS = 12
 _CONTROLLER_CONSTANTS = (
     "thigh shank weight weight_of_feet omega velocity_share zmp_share weight_share"
-    " force_difference force_difference_decay_s force_difference_limit_m dcm zmp_limit_m"
-    " friction_rate_rad_s"
+    " force_difference force_difference_decay_s force_difference_limit_m dcm"
+    " zmp_limit_m friction_rate_rad_s"
 )
 _GAINS = "proportional integral derivative leak_s trim integral_limit filter_share swing_share"
 
@@ -59,21 +48,23 @@ def c_walker(policy: Any, prefix: str) -> str:
         tables |= _adaptive_tables(layers)
     digest = sha256("\n".join(tables.values()).encode()).hexdigest()
     joints = [
-        f"  {j:2}  {plain_text(name)}: K {model.stiffness[j]:.6g} N*m/rad"
+        f"  {j:2}  {c_text.plain_text(name)}: K {model.stiffness[j]:.6g} N*m/rad"
         for j, name in enumerate(model.joint_names)
     ]
-    return fill_template(
+    return c_text.fill_template(
         "walker.h.in",
         prefix,
         **tables,
         policy="adaptive_posture" if is_adaptive else "input_output",
         is_adaptive=str(int(is_adaptive)),
-        adaptive=fill_template("walker_adaptive.h.in", prefix, **tables) if is_adaptive else "",
-        vectors=fill_template("common_vectors.h.in", prefix),
+        adaptive=c_text.fill_template("walker_adaptive.h.in", prefix, **tables)
+        if is_adaptive
+        else "",
+        vectors=c_text.fill_template("common_vectors.h.in", prefix),
         digest=digest,
-        origin=comment([GENERATED]),
-        joints=comment(joints),
-        period_s=number(model.control_period_s),
+        origin=c_text.comment([c_text.GENERATED]),
+        joints=c_text.comment(joints),
+        period_s=c_text.number(model.control_period_s),
         test=_test_vector(policy, prefix),
     )
 
@@ -89,24 +80,24 @@ def _tables(policy: Compensated, model: WalkerModel) -> dict[str, str]:
     feet = links[[int(np.flatnonzero(links["tip"] == foot)[0]) for foot in range(2)]]
     command_compliance = 1.0 / model.stiffness + compensator.servo_compliance
     return {
-        **{name: number(constants[name]) for name in _CONTROLLER_CONSTANTS.split()},
-        "control_period_s": number(constants["period_s"]),
+        **{name: c_text.number(constants[name]) for name in _CONTROLLER_CONSTANTS.split()},
+        "control_period_s": c_text.number(constants["period_s"]),
         "is_com_fed_back": str(int(constants["is_com_fed_back"])),
         "is_at_zmp": str(int(contact["is_at_zmp"])),
-        "gravity": number(contact["gravity"]),
-        "mass": number(contact["mass"]),
-        "ankle_height": number(contact["ankle_height"]),
-        "sole_depth": number(model.biped.ankle_height),
+        "gravity": c_text.number(contact["gravity"]),
+        "mass": c_text.number(contact["mass"]),
+        "ankle_height": c_text.number(contact["ankle_height"]),
+        "sole_depth": c_text.number(model.biped.ankle_height),
         "links": ",\n".join(map(_link_text, links)),
-        "foot_R": ", ".join(number_list(row["tip_R"]) for row in feet),
-        "foot_place": ", ".join(number_list(row["tip_place"]) for row in feet),
-        "stiffness": numbers(model.stiffness),
-        "of_command": numbers(command_compliance),
-        "friction": numbers(constants["friction_deflection"]),
+        "foot_R": ", ".join(c_text.number_list(row["tip_R"]) for row in feet),
+        "foot_place": ", ".join(c_text.number_list(row["tip_place"]) for row in feet),
+        "stiffness": c_text.numbers(model.stiffness),
+        "of_command": c_text.numbers(command_compliance),
+        "friction": c_text.numbers(constants["friction_deflection"]),
         "feedback_steps": str(len(controller.ramp)),
-        "feedback_ramp": numbers(controller.ramp),
+        "feedback_ramp": c_text.numbers(controller.ramp),
         "steps": str(len(policy.ramp)),
-        "ramp": numbers(policy.ramp),
+        "ramp": c_text.numbers(policy.ramp),
     }
 
 
@@ -121,18 +112,18 @@ def _adaptive_tables(layers: WalkerLayers) -> dict[str, str]:
         "turn_limit": gains["limit_rad"],
         "correction_limit": adaptive.limit,
         "correction_share": adaptive.share,
-        "error_variance": MODEL_ERROR**2,
-        "offset_variance": OFFSET_RAD**2,
-        "measured_variance": DISAGREEMENT_RAD**2,
-        "loaded_n": LOADED_SHARE * carried,
+        "error_variance": model_error.MODEL_ERROR**2,
+        "offset_variance": model_error.OFFSET_RAD**2,
+        "measured_variance": model_error.DISAGREEMENT_RAD**2,
+        "loaded_n": model_error.LOADED_SHARE * carried,
         "carried_n": carried,
         "assumed_loads": ASSUMED_LOADS,
     }
     return {
-        **{name: number(value) for name, value in constants.items()},
+        **{name: c_text.number(value) for name, value in constants.items()},
         "estimate_every": str(adaptive.every),
-        "foot_mass": numbers(-mass),
-        "foot_point": ", ".join(map(number_list, point)),
+        "foot_mass": c_text.numbers(-mass),
+        "foot_point": ", ".join(map(c_text.number_list, point)),
     }
 
 
@@ -153,23 +144,23 @@ def _masses_below_sensors(model: WalkerModel) -> tuple[Array, Array]:
 
 def _link_text(row: Any) -> str:
     place = f"{row['parent']}, {row['column']}, {row['tip']}"
-    return f"    {{{place}, {member_values(row, 'zero R anchor weight weight_moment')}}}"
+    return f"    {{{place}, {c_text.member_text(row, 'zero R anchor weight weight_moment')}}}"
 
 
 def _test_vector(policy: Any, prefix: str) -> str:
     steps = play_steps(policy, _TEST_STEPS)
-    return fill_template(
+    return c_text.fill_template(
         "walker_test.h.in",
         prefix,
         count=_TEST_STEPS,
         shown=_struct_lines(steps.shown),
         plan=_struct_lines(steps.plan),
-        offset=row_lines(steps.offset),
-        links=row_lines(steps.links),
+        offset=c_text.row_lines(steps.offset),
+        links=c_text.row_lines(steps.links),
     )
 
 
 def _struct_lines(fields: list[Array]) -> str:
     """Rows of fields as initialisers of structs, a row on a line."""
-    rows = [", ".join(map(initialiser, row)) for row in zip(*fields, strict=True)]
+    rows = [", ".join(map(c_text.initialiser, row)) for row in zip(*fields, strict=True)]
     return ",\n".join(f"    {{{row}}}" for row in rows)

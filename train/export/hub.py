@@ -178,8 +178,8 @@ def _require_small(hub: Any, repository: str, revision: str) -> None:
     for name, most in _MOST_BYTES.items():
         if name not in sizes:
             raise ConfigurationError(
-                f"{shorten(repository)} holds no residual: it needs {DESCRIPTION} and {WEIGHTS} at"
-                f" its top, and has {list_names(sizes) or 'no files'}"
+                f"{shorten(repository)} holds no residual: it needs {DESCRIPTION} and"
+                f" {WEIGHTS} at its top, and has {list_names(sizes) or 'no files'}"
             )
         size = sizes[name]
         if size is None or not 0 < size <= most:
@@ -213,8 +213,8 @@ def _check_files(
 def _weights_digest(description: ResidualDescription, folder: Path) -> str:
     if description.weights_sha256 is None:
         raise ConfigurationError(
-            f"{DESCRIPTION} of {shorten(folder)} names no digest of its weights; give it their"
-            " SHA-256 as weights_sha256"
+            f"{DESCRIPTION} of {shorten(folder)} names no digest of its weights; give"
+            " it their SHA-256 as weights_sha256"
         )
     return description.weights_sha256
 
@@ -226,7 +226,7 @@ def _explain_errors(repository: str, revision: str | None) -> Iterator[None]:
     from huggingface_hub import errors
 
     name = shorten(repository)
-    problems = {
+    causes = {
         errors.HFValidationError: "a repository is OWNER/NAME, in letters, digits, and . _ -, got"
         f" {quote(repository)}",
         errors.RevisionNotFoundError: f"{name} has no revision {quote(revision)}; give a branch, a"
@@ -238,15 +238,15 @@ def _explain_errors(repository: str, revision: str | None) -> Iterator[None]:
     }
     try:
         yield
-    except tuple(problems) as error:
-        problem = next(text for kind, text in problems.items() if isinstance(error, kind))
+    except tuple(causes) as error:
+        problem = next(text for kind, text in causes.items() if isinstance(error, kind))
         raise ConfigurationError(problem) from None
     except errors.HfHubHTTPError as error:
         status = getattr(error.response, "status_code", None)
         if status in (401, 403):
             raise ConfigurationError(
-                f"the hub refuses {name} ({status}); log in by: hf auth login, with a token that"
-                " may write"
+                f"the hub refuses {name} ({status}); log in by: hf auth login, with a"
+                " token that may write"
             ) from None
         raise SystemFailedError(f"the hub answers {status} for {name}; try again later") from None
     except JSONDecodeError:
@@ -255,6 +255,6 @@ def _explain_errors(repository: str, revision: str | None) -> Iterator[None]:
         ) from None
     except (OSError, HTTPError) as error:
         raise SystemFailedError(
-            f"the hub was not reached ({type(error).__name__}); check the network, or pull with"
-            " --offline what was pulled before"
+            f"the hub was not reached ({type(error).__name__}); check the network, or"
+            " pull with --offline what was pulled before"
         ) from None

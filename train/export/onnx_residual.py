@@ -63,7 +63,8 @@ def _add_network(graph: "_Graph", features: str, layout: ResidualLayout) -> str:
     """Add normalisation and layers; return their result in double precision."""
     description = layout.description
     tensors = layout.tensors
-    mean, std = (graph.add_constant(tensors[name].astype(np.float64)) for name in ("mean", "std"))
+    mean = graph.add_constant(tensors["mean"].astype(np.float64))
+    std = graph.add_constant(tensors["std"].astype(np.float64))
     scaled = graph.add_node("Div", graph.add_node("Sub", features, mean), std)
     clip = graph.add_constant(-description.clip), graph.add_constant(description.clip)
     x = graph.cast(graph.add_node("Clip", scaled, *clip), np.float32)

@@ -116,19 +116,17 @@ class ResidualLayout:
             on_right: True if the step is on the right foot, (N, 1); without a mirror it has no
                 effect.
         """
-        if self.mirrors is None:
-            residual = self.network(features)
-        else:
-            mirror_features, mirror_residual = self.mirrors
-            residual = self.network(np.where(on_right, mirror_features(features), features))
-            residual = np.where(on_right, mirror_residual(residual), residual)
+        if self.mirrors is not None:
+            features = np.where(on_right, self.mirrors[0](features), features)
+        residual = self.network(features)
+        if self.mirrors is not None:
+            residual = np.where(on_right, self.mirrors[1](residual), residual)
         return residual, self.bounds * residual[:, self.source]
 
     def draw(self, count: int, seed: int = 0) -> dict[str, Any]:
         """Draw random arguments of `decide`; some features are beyond the bound of the network."""
         generator = np.random.default_rng(seed)
-        shape = (count, len(self.features))
-        normalised = generator.standard_t(_HEAVY_TAIL, shape)
+        normalised = generator.standard_t(_HEAVY_TAIL, (count, len(self.features)))
         features = self.tensors["mean"] + self.tensors["std"] * normalised
         on_right = generator.random((count, 1)) < 0.5
         if self.mirrors is not None:  # `decide` mirrors them back

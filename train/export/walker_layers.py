@@ -44,6 +44,6 @@ def find_layers(policy: Any) -> WalkerLayers:
         if taylor.output == "taylor" and taylor.gravity.chains is model.biped.chains:
             return WalkerLayers(inner, model, posture, adaptive)
     raise ConfigurationError(
-        "only input_output and adaptive_posture of a walker can be exported to C, with output:"
-        " taylor and gravity: com or ankle"
+        "only input_output and adaptive_posture of a walker can be exported to C, with"
+        " output: taylor and gravity: com or ankle"
     )

@@ -46,7 +46,8 @@ def play_steps(policy: Any, count: int, seed: int = 0) -> PlayedSteps:
     """
     model = find_layers(policy).model
     row = np.linspace(1.0, model.plan.num_steps, count).astype(np.int64)
-    return play_observations(policy, _random_observations(model, row, np.random.default_rng(seed)))
+    rows = _random_observations(model, row, np.random.default_rng(seed))
+    return play_observations(policy, rows)
 
 
 def play_observations(policy: Any, rows: Array) -> PlayedSteps:
@@ -109,8 +110,7 @@ def _sensor_fields(layers: WalkerLayers, rows: Array) -> list[Array]:
     reference = [rows[:, table.group(name)] for name in ("reference_angle", "reference_rate")]
     share = rows[:, table.group("load_share")][:, 0]
     support: Any = rows[:, table.columns("clock.support")][:, 0].astype(np.int64)
-    zmp = rows[:, table.group("zmp_reference")]
-    return [*sensors, *reference, share, zmp, support]
+    return [*sensors, *reference, share, rows[:, table.group("zmp_reference")], support]
 
 
 def _plan_fields(model: WalkerModel, row: IntArray) -> list[Array]:

@@ -6,7 +6,7 @@ Pictures and the page of a report draw the same charts.
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -46,6 +46,13 @@ class Curve:
     has_points: bool = False
     fails: bool = False
     crosses: Sequence[bool] = ()
+
+    @classmethod
+    def median(cls, name: str, colour: str, x: Array, y: Array, **look: Any) -> Self:
+        """Median of several series, (series, n), with a band from the least to the greatest."""
+        low, middle, high = quantiles(y)
+        band = (low, high) if len(y) > 1 else None
+        return cls(name, colour, x, middle, band=band, **look)
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,13 +116,6 @@ class Chart:
     marks: Sequence[Mark] = ()
     ticks: Sequence[float] | None = None
     width: float = 7.2
-
-
-def median_curve(name: str, colour: str, x: Array, values: Array, **look: Any) -> Curve:
-    """Median of several series, (series, n), with a band from the least to the greatest."""
-    low, middle, high = quantiles(values)
-    band = (low, high) if len(values) > 1 else None
-    return Curve(name, colour, x, middle, band=band, **look)
 
 
 def quantiles(values: Array) -> tuple[Array, Array, Array]:

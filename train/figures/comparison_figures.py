@@ -74,8 +74,9 @@ def draw_figures(
     files.insert(0, draw_overview(evaluations, environment.judged, overview))
     for group in group_cells(evaluations):
         by_policy = group_by(group, lambda e: e.condition.policy.title)
-        shown = [seeds for t, seeds in by_policy.items() if not policies or t in policies]
-        files += draw_signals(list(chain(*shown)), folder, figure_format) if shown else []
+        shown = [runs for t, runs in by_policy.items() if not policies or t in policies]
+        if shown:
+            files += draw_signals(list(chain(*shown)), folder, figure_format)
     return files
 
 
@@ -98,7 +99,7 @@ def draw_signals(
         figure_format: Format of the files.
     """
     first = evaluations[0]
-    signal_groups = group_by(first.condition.environment.curves, lambda signal: signal.picture)
+    signal_groups = group_by(first.condition.environment.curves, lambda s: s.picture)
     files = []
     for name, signals in signal_groups.items():
         if name:
@@ -165,16 +166,16 @@ def group_cells(evaluations: Evaluations) -> list[list[Evaluation]]:
 
 def group_by_option(evaluations: Evaluations) -> Cells:
     """Group evaluations of every policy by the swept value; None if the policy is not swept."""
-    return _group_policies(evaluations, lambda e: next(iter(e.condition.swept.values()), None))
+    return _cells(evaluations, lambda e: next(iter(e.condition.swept.values()), None))
 
 
 def group_by_reference(evaluations: Evaluations) -> Cells:
     """Group evaluations of every policy by the number of the reference, such as a step period."""
     numbered = [e for e in evaluations if e.condition.number is not None]
-    return _group_policies(numbered, lambda e: e.condition.number)
+    return _cells(numbered, lambda e: e.condition.number)
 
 
-def _group_policies(evaluations: Evaluations, key: Callable[[Evaluation], Any]) -> Cells:
+def _cells(evaluations: Evaluations, key: Callable[[Evaluation], Any]) -> Cells:
     policies = group_by(evaluations, lambda e: e.condition.policy.title)
     return {title: group_by(cells, key) for title, cells in policies.items()}
 
@@ -200,13 +201,15 @@ def sweep_charts(
     charts = {}
     if swept is not None:
         for group in group_cells(evaluations):
-            chart = sweep_chart(group_by_option(group), columns, swept, colours, statistic)
+            cells = group_by_option(group)
+            chart = sweep_chart(cells, columns, swept, colours, statistic)
             charts[_cell_name(group[0])] = replace(chart, title=_title(group[0].condition))
         return charts
     label = f"{evaluations[0].condition.environment.quantity} [s]"
     for scenario, group in group_by(evaluations, lambda e: e.condition.scenario).items():
         if has_swept_references(group):
-            chart = sweep_chart(group_by_reference(group), columns, label, colours, statistic)
+            cells = group_by_reference(group)
+            chart = sweep_chart(cells, columns, label, colours, statistic)
             charts[_file_name(scenario)] = replace(chart, title=f"Scenario {scenario}")
     return charts
 

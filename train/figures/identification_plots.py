@@ -22,12 +22,12 @@ from train.figures.plots import MRAD, label_text, new_figure, save, show_numbers
 _FIT_COLOUR = "#2a6f97"
 _RIVAL_COLOUR = "#9aa5b1"
 _LINE_COLOUR = "#888888"
-_MEASURED_COLOUR = "#222222"
+_LOG_COLOUR = "#222222"
 _REPLAY_COLOUR = "#d1495b"
 _JOINTS_PER_ROW = 4
 _LOGS_PER_ROW = 3
 _MOST_LOGS = 12
-_SMALLEST_LEVER = 0.1  # of the joint's largest; the joint's panel leaves out the other poses
+_SMALLEST_LEVER = 0.1  # of the joint's largest; its panel leaves out other poses
 _SMALLEST_JOINT_LEVER = 0.01  # of the largest of all joints
 _MOST_NAMED_COLUMNS = 3  # of a measurement, in a legend
 _SMALLEST_HEIGHT = 3.4
@@ -130,8 +130,8 @@ def deflections(fit: ArmFit) -> tuple[Array, Array]:
     lever = model.predict(fit.unknowns)[1][..., model.unknowns.slices["offset"]]
     size = np.sum(lever**2, axis=1)
     largest = size.max(axis=0)
-    smallest = np.maximum(_SMALLEST_LEVER**2 * largest, _SMALLEST_JOINT_LEVER**2 * largest.max())
-    is_measured = size > smallest
+    of_all = _SMALLEST_JOINT_LEVER**2 * largest.max()
+    is_measured = size > np.maximum(_SMALLEST_LEVER**2 * largest, of_all)
     projection = np.sum(lever * fit.residual[..., None], axis=1)
     measured = predicted + projection / np.where(is_measured, size, 1.0)
     return predicted, np.where(is_measured, measured, np.nan)
@@ -178,7 +178,7 @@ def _stiffness_text(joint: Any) -> str:
 
 def draw_geometry(result: GeometryIdentification, path: Path) -> Path:
     """Draw held-out errors and those of rivals, the error over the number of poses, and K."""
-    joints = [joint for joint in result.joints if np.isfinite(joint.stiffness_nm_per_rad)]
+    joints = [j for j in result.joints if np.isfinite(j.stiffness_nm_per_rad)]
     panels = 1 if result.held_out is None else 3
     height = max(_SMALLEST_HEIGHT, _ROW_HEIGHT * len(joints) + 1.2)
     figure, axes = new_figure(1, panels, (4.3 * panels, height))
@@ -244,7 +244,7 @@ def draw_servo(
     for axis, (log, q) in zip(axes, pairs, strict=False):
         goal = np.where(log.enabled, log.goal, np.nan)
         axis.plot(log.time, goal, "--", color=_RIVAL_COLOUR, lw=1.2, label="goal")
-        axis.plot(log.time, log.position, color=_MEASURED_COLOUR, lw=1.6, label="measured")
+        axis.plot(log.time, log.position, color=_LOG_COLOUR, lw=1.6, label="measured")
         axis.plot(log.time, q, color=_REPLAY_COLOUR, lw=1.2, label="replayed")
         rms = MRAD * float(np.sqrt(np.mean((q - log.position) ** 2)))
         gain = "" if log.gain is None else f", gain {log.gain:g}"

@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from train.evaluate.change_text import BEST_ANALYTIC, SIGNS, percent
 from train.evaluate.environments import Column
 from train.evaluate.maps import HeatMap, MapCell
-from train.evaluate.terms import BEST_ANALYTIC, SIGNS, percent
 from train.figures.colours import INK, policy_colours
 from train.figures.plots import new_figure, save
 
@@ -106,8 +106,8 @@ def panels(heat_map: HeatMap) -> list[Panel]:
     result = [panel(f"Best policy, and its {column.label}", best, key=key)]
     for title in heat_map.table.members:
         change = partial(_change_square, title=title, letters=rival_letters)
-        panel_title = f"{title} against the {BEST_ANALYTIC}, change of {column.title} [%]"
-        result.append(panel(panel_title, change))
+        text = f"{title} against the {BEST_ANALYTIC}, change of {column.title} [%]"
+        result.append(panel(text, change))
     for title in policies:
         score = partial(_score_square, title=title, column=column, ends=ends)
         result.append(panel(f"{title}, {column.label}", score, is_main=False))

@@ -251,14 +251,14 @@ def _overview_handles(
         failure = evaluations[0].condition.environment.failure
         handles.append(axis.scatter([], [], marker="X", s=26, color=FAILED, label=failure))
     if any(len(e.episodes) > 1 for e in evaluations):
-        handles.append(axis.scatter([], [], label="episode (bar: median)", **_DOT_STYLE))
-    if any(median_of(e, column.metric).has_interval for e in evaluations for column in columns):
+        handles.append(axis.scatter([], [], label="episode (bar: median)", **_DOTS))
+    if any(median_of(e, c.metric).has_interval for e in evaluations for c in columns):
         style = {"marker": "|", "lw": 0.0, "ms": 9, "mew": _INTERVAL_STYLE["lw"], "color": INK}
         handles += axis.plot([], [], label="95 % interval of the median", **style)
     return handles
 
 
-_DOT_STYLE: dict[str, Any] = {"s": 4, "color": "#222222", "alpha": 0.45, "lw": 0, "zorder": 3}
+_DOTS: dict[str, Any] = {"s": 4, "color": "#222222", "alpha": 0.45, "lw": 0, "zorder": 3}
 """Style of single episodes."""
 _INTERVAL_STYLE: dict[str, Any] = {"lw": 1.3, "color": INK, "zorder": 4}
 """Style of an interval, drawn next to the dots."""
@@ -287,7 +287,7 @@ def _draw_bars(
             height = level.value if level.is_known else 0.0
             axis.bar(x, height, width=0.9 * width, color=shade)
             if len(e.episodes) > 1:
-                axis.scatter(np.full(len(values), x), values, **_DOT_STYLE)
+                axis.scatter(np.full(len(values), x), values, **_DOTS)
             if level.has_interval:
                 axis.vlines(x + 0.25 * width, *level.ends, **_INTERVAL_STYLE)
             if e.num_failed:

@@ -9,7 +9,7 @@ import numpy as np
 from train.evaluate.environments import Column
 from train.evaluate.progress import Curves
 from train.evaluate.statistics import Estimate
-from train.figures.chart import Cells, Chart, Colours, Curve, Evaluations, Panel, median_curve
+from train.figures.chart import Cells, Chart, Colours, Curve, Evaluations, Panel
 from train.figures.colours import REFERENCE, dash_of
 
 Statistic = Callable[[Evaluations, Column], Estimate]
@@ -47,7 +47,7 @@ def sweep_chart(
             x = [value for value in values if value in points]
             if is_level:
                 x = [values[0], values[-1]]
-            scores = [statistic(points[None if is_level else value], column) for value in x]
+            scores = [statistic(points[None if is_level else key], column) for key in x]
             scores = [score.times(column.scale) for score in scores]
             low, high = np.array([score.ends for score in scores]).T
             has_band = not is_level and any(score.has_interval for score in scores)
@@ -73,7 +73,7 @@ def _failure_panels(cells: Cells, values: Sequence[float], colours: Colours) -> 
     for title, points in cells.items():
         all_failed = {}
         for value in values:
-            cell = points.get(value, points.get(None, ()))  # a level counts at all values
+            cell = points.get(value, points.get(None, ()))  # a level counts everywhere
             failed = sum(e.num_failed for e in cell)
             if failed:
                 all_failed[value] = failed == sum(len(e.episodes) for e in cell)
@@ -83,7 +83,7 @@ def _failure_panels(cells: Cells, values: Sequence[float], colours: Colours) -> 
             crosses = list(all_failed.values())
             curves.append(Curve("", colours[title], x, y, crosses=crosses))
             rows.append(title)
-    first = next(e for points in cells.values() for e in chain(*points.values())).condition
+    first = next(e for row in cells.values() for e in chain(*row.values())).condition
     limits = (len(rows) - 0.4, -0.6)
     height = 0.2 * len(rows) + 0.2
     panel = Panel(first.environment.failure, curves, limits, height=height, rows=rows)
@@ -99,7 +99,7 @@ def learning_chart(
         curves = []
         for title, seeds in learning.items():
             line = (title, colours[title], seeds.decisions, seeds.ratios[column.metric])
-            curves.append(median_curve(*line, width=2.0, has_points=True))
+            curves.append(Curve.median(*line, width=2.0, has_points=True))
         ends = np.array([0.0, max(curve.x[-1] for curve in curves)])
         ratios = [seeds.ratios[column.metric].ravel() for seeds in learning.values()]
         top = min(float(np.nanmax(np.concatenate(ratios), initial=1.0)), 2.0)
@@ -121,8 +121,8 @@ def trials_chart(trials: Sequence[Any], columns: Sequence[Column], title: str) -
     failed = np.array([trial.failed for trial in trials])
     panels = []
     for column in columns:
-        metrics = [[robot[column.metric] for robot in trial.metrics] for trial in trials]
-        values = column.scale * np.array(metrics)
+        scores = [[m[column.metric] for m in trial.metrics] for trial in trials]
+        values = column.scale * np.array(scores)
         values[failed] = np.nan
         counts = np.isfinite(values).sum(axis=1)
         sums = np.nansum(values, axis=1)

@@ -8,7 +8,7 @@ import numpy as np
 from elastic_env.core.signals import Array
 from elastic_env.motion.trajectory import STAND_S
 from train.evaluate.environments import TracedSignal
-from train.figures.chart import Chart, Colours, Curve, Evaluations, Mark, Panel, median_curve
+from train.figures.chart import Chart, Colours, Curve, Evaluations, Mark, Panel
 from train.figures.colours import RAMP, REFERENCE, SCORED, dash_of
 
 
@@ -41,9 +41,7 @@ def time_chart(
     parts = _split_policies(policies, signals, most)
     panels = []
     for signal, titles in product(signals, parts):
-        curves = [
-            _trace_curve(title, colours[title], policies[title], signal, stride) for title in titles
-        ]
+        curves = [_curve(t, colours[t], policies[t], signal, stride) for t in titles]
         if signal.reference is not None:
             y = signal.scale * longest[signal.reference][::stride]
             look = (REFERENCE, time_s[::stride], y, "dash")
@@ -66,14 +64,14 @@ def _split_policies(
     number = -(-len(policies) // most)
     if number == 1:
         return [list(policies)]
-    errors = np.array([[_error_rms(seeds, s) for s in signals] for seeds in policies.values()])
+    errors = np.array([[_rms(runs, s) for s in signals] for runs in policies.values()])
     sizes = np.nansum(errors / np.maximum(np.nanmax(errors, axis=0), 1e-12), axis=1)
     titles = list(policies)
     order = [titles[index] for index in np.argsort(-sizes, kind="stable")]
     return [list(part) for part in np.array_split(order, number)]
 
 
-def _error_rms(evaluations: Evaluations, signal: TracedSignal) -> float:
+def _rms(evaluations: Evaluations, signal: TracedSignal) -> float:
     """RMS of a signal minus its reference, without the time shortly before a fall."""
     parts = []
     for e in evaluations:
@@ -97,16 +95,14 @@ def _longest_trace(evaluations: Evaluations) -> Mapping[str, Array]:
     return max((e.trace for e in evaluations), key=lambda trace: len(trace["time_s"]))
 
 
-def _trace_curve(
-    title: str, colour: str, seeds: Evaluations, signal: TracedSignal, stride: int
-) -> Curve:
+def _curve(title: str, colour: str, seeds: Evaluations, signal: TracedSignal, stride: int) -> Curve:
     """Curve of a signal under a policy, from an evaluation per training seed."""
     time_s = _longest_trace(seeds)["time_s"]
     values = np.full((len(seeds), len(time_s)), np.nan)
     for row, e in zip(values, seeds, strict=True):
         row[: len(e.trace[signal.name])] = signal.scale * e.trace[signal.name]
     look = {"dash": dash_of(title), "fails": len(seeds) == 1 and seeds[0].first_failed}
-    return median_curve(title, colour, time_s[::stride], values[:, ::stride], **look)
+    return Curve.median(title, colour, time_s[::stride], values[:, ::stride], **look)
 
 
 def _axis_limits(evaluations: Evaluations, signal: TracedSignal) -> tuple[float, float]:
@@ -116,7 +112,7 @@ def _axis_limits(evaluations: Evaluations, signal: TracedSignal) -> tuple[float,
     if not any(mask.any() for mask in masks):
         masks = [e.is_steady for e in evaluations]
     pairs = zip(evaluations, masks, strict=True)
-    values = np.concatenate([e.trace[name][mask] for e, mask in pairs for name in names])
+    values = np.concatenate([e.trace[n][mask] for e, mask in pairs for n in names])
     values = signal.scale * values[np.isfinite(values)]
     if len(values) == 0:
         return -1.0, 1.0

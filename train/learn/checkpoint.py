@@ -84,8 +84,8 @@ def require_complete(checkpoint: Path) -> None:
 def damage_error(checkpoint: Path, problem: object) -> ElasticError:
     """The error for a checkpoint that a training cannot continue from."""
     return ElasticError(
-        f"the checkpoint {shorten(checkpoint)} is damaged or incomplete ({problem}); remove it to"
-        " start this seed again"
+        f"the checkpoint {shorten(checkpoint)} is damaged or incomplete ({problem});"
+        " remove it to start this seed again"
     )
 
 
@@ -131,6 +131,6 @@ def read_state(folder: Path, name: str) -> Any:
                 if set(value) == {_ARRAY_KEY}:
                     return arrays[value[_ARRAY_KEY]]
                 return {name: from_json(part) for name, part in value.items()}
-            return [from_json(part) for part in value] if isinstance(value, list) else value
+            return [from_json(v) for v in value] if isinstance(value, list) else value
 
         return from_json(json.loads((folder / f"{name}.json").read_text()))

@@ -49,8 +49,8 @@ class ConstantSearch(Trainer):
         episodes = config.worlds // needed
         if episodes == 0:
             raise ConfigurationError(
-                f"CMA-ES needs a world for each of {self._population} candidates in each scenario,"
-                f" {needed}, got worlds: {config.worlds}"
+                f"CMA-ES needs a world for each of {self._population} candidates in"
+                f" each scenario, {needed}, got worlds: {config.worlds}"
             )
         self._episodes = episodes
         self._first = first_episode(self._seed)
@@ -101,7 +101,8 @@ class ConstantSearch(Trainer):
         seeds = self._first + generation * self._episodes + np.arange(self._episodes)
         self._worlds.reset(seed=np.tile(seeds, n // self._episodes).tolist())
         # worlds in the order scenario, candidate, episode
-        residuals = np.tile(np.repeat(candidates, self._episodes, axis=0), (scenarios, 1))
+        repeated = np.repeat(candidates, self._episodes, axis=0)
+        residuals = np.tile(repeated, (scenarios, 1))
         total = np.zeros(n)
         alive = np.ones(n, dtype=np.bool_)
         while alive.any():

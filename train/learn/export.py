@@ -53,8 +53,8 @@ def explain_option_errors(algorithm: str, options: Mapping[str, Any]) -> Iterato
         raise
     except Exception as error:
         raise ConfigurationError(
-            f"{algorithm} cannot be built with algorithm_options {quote(dict(options))}: "
-            f"{error or type(error).__name__}"
+            f"{algorithm} cannot be built with algorithm_options"
+            f" {quote(dict(options))}: {error or type(error).__name__}"
         ) from error
 
 
@@ -108,9 +108,9 @@ def _require_widths(tensors: Tensors, config: TrainConfig) -> list[str]:
     widths = tensors["weight0"].shape[1], len(tensors[f"bias{layers - 1}"])
     if widths != (num_features, num_residuals):
         raise ConfigurationError(
-            f"the model takes {widths[0]} features and gives {widths[1]} residuals, a residual on"
-            f" {config.base} of the {config.env} with these settings sees {num_features} and gives"
-            f" {num_residuals}"
+            f"the model takes {widths[0]} features and gives {widths[1]} residuals, a"
+            f" residual on {config.base} of the {config.env} with these settings sees"
+            f" {num_features} and gives {num_residuals}"
         )
     return joints
 
@@ -137,13 +137,13 @@ def export_zip(
     """
     if config.settings.privileged:
         raise ConfigurationError(
-            f"a teacher, which sees the true {', '.join(config.settings.privileged)}, is no"
-            " residual for a robot and is not exported; leave privileged out"
+            f"a teacher, which sees the true {', '.join(config.settings.privileged)},"
+            " is no residual for a robot and is not exported; leave privileged out"
         )
     if not trust_pickle:
         raise ConfigurationError(
-            f"{path} is a pickle in a zip, and loading it runs code from it; add --trust-pickle if"
-            " you trust its origin"
+            f"{path} is a pickle in a zip, and loading it runs code from it; add"
+            " --trust-pickle if you trust its origin"
         )
     for file in (path, normaliser):
         if file is not None and not file.is_file():

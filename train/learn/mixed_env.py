@@ -55,7 +55,8 @@ class MixedVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
                 raise _mixture_error(f"have autoreset_mode Disabled, got {mode.value}")
             if env.single_observation_space != self.envs[0].single_observation_space:
                 raise _mixture_error("have the same observation")
-            if (env.task.name, env.task.num_steps) != (self.task.name, self.task.num_steps):
+            task = env.task
+            if (task.name, task.num_steps) != (self.task.name, self.task.num_steps):
                 raise _mixture_error("have the same task and motion")
             if env.assumed_model.joints != self.assumed_model.joints:
                 raise _mixture_error(
@@ -102,8 +103,8 @@ class MixedVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         def begin(env: Any, worlds: slice) -> Array:
             if not mask[worlds].any():
                 return np.asarray(env.task.observe())
-            env_seeds = None if seeds is None else list(seeds[worlds])
-            observation, _ = env.reset(seed=env_seeds, options={"reset_mask": mask[worlds]})
+            part = None if seeds is None else list(seeds[worlds])
+            observation, _ = env.reset(seed=part, options={"reset_mask": mask[worlds]})
             return np.asarray(observation)
 
         return np.concatenate(self._run_parallel(begin)), {}

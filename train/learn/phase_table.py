@@ -95,7 +95,7 @@ class Harmonics(NamedTuple):
         planes = []
         for names, _ in _PLANES:
             pairs = [columns[name].reshape(-1, 2) / _SCALE[name] for name in names]
-            planes.append(np.stack([pair[:, 0] - 1j * pair[:, 1] for pair in pairs], axis=1))
+            planes.append(np.stack([p[:, 0] - 1j * p[:, 1] for p in pairs], axis=1))
         return cls(np.array(planes))
 
     def table(self, search: Search) -> PhaseTable:
@@ -103,7 +103,8 @@ class Harmonics(NamedTuple):
         columns: dict[str, Any] = {}
         for (names, _), plane in zip(_PLANES, self.planes, strict=True):
             for i, name in enumerate(names):
-                pairs = _SCALE[name] * np.stack([plane[:, i].real, -plane[:, i].imag], axis=1)
+                parts = [plane[:, i].real, -plane[:, i].imag]
+                pairs = _SCALE[name] * np.stack(parts, axis=1)
                 columns[name] = np.round(pairs, _DECIMALS).tolist()
         robots = f"{search.robots} robots of bank 1 in {search.scenario}"
         return PhaseTable(
@@ -216,7 +217,8 @@ def find_table(search: Search) -> PhaseTable:
         response = []
         for channel, title in enumerate(("ZMP", "hips")):
             inputs = probe_inputs(search.num_harmonics, channel)
-            change = play(inputs, f"probe of {title}").errors.planes - before.errors.planes
+            errors = play(inputs, f"probe of {title}").errors
+            change = errors.planes - before.errors.planes
             response.append(change / inputs.planes[:, :, channel, None])
         matrix = np.stack(response, axis=-1)
         plays = [before]
@@ -235,8 +237,7 @@ def best_play(plays: Sequence[Play]) -> Play:
 def main(search: Search) -> None:
     """Find a table, and write it."""
     table = find_table(search)
-    name = f"{round(1000.0 * search.step_period)}ms.json"
-    file = search.output or FOLDER / name
+    file = search.output or FOLDER / f"{round(1000.0 * search.step_period)}ms.json"
     file.parent.mkdir(parents=True, exist_ok=True)
     write_whole(file, table.model_dump_json(indent=2) + "\n")
     Console().print(f"wrote {file}")

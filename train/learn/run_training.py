@@ -120,18 +120,18 @@ def _train(runs: Sequence[Run], console: Console, executors: Executors) -> None:
     names = [f"seed {seed}" for _, seed in calls]
     if len(runs) > 1:
         names = [f"{run.folder}, seed {seed}" for run, seed in calls]
-    totals = {name: run.config.decisions for name, (run, _) in zip(names, calls, strict=True)}
+    totals = dict(zip(names, (r.config.decisions for r, _ in calls), strict=True))
     with show_progress(console, totals, unit="decisions") as show:
         if executors == ONE_BY_ONE:
             for number, (run, seed) in enumerate(calls):
                 _train_seed(run, seed, 0, partial(show, number))
         else:
             threads = executors.threads_per_call(len(calls))
-            arguments = [(Run(r.config, r.folder.resolve()), seed, threads) for r, seed in calls]
+            args = [(Run(r.config, r.folder.resolve()), seed, threads) for r, seed in calls]
             watch = _watch(names, console, show)
-            with executors.open_pool(len(arguments), runs[0].folder) as pool:
+            with executors.open_pool(len(args), runs[0].folder) as pool:
                 # Ctrl-C does not wait: a seed may take hours, and resumes from its checkpoint
-                outcomes = run_calls(_train_seed, arguments, pool, watch, finishes=False)
+                outcomes = run_calls(_train_seed, args, pool, watch, finishes=False)
             _raise_first_error(names, outcomes)
     for run in runs:
         console.print(_score_table(run.config, run.folder))

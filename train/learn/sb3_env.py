@@ -95,7 +95,7 @@ class SB3VecEnv(VecEnv):
             scored = final.get("_episode_metrics", done)
             for world in np.flatnonzero(done).tolist():
                 recorded = metrics if scored[world] else {}
-                own_metrics = {name: values[world].item() for name, values in recorded.items()}
+                own_metrics = {k: v[world].item() for k, v in recorded.items()}
                 is_cut = bool(truncated[world] and not terminated[world])
                 infos[world] = {
                     "terminal_observation": info["final_obs"][world],

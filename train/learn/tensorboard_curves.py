@@ -41,7 +41,8 @@ class RewardLogger(Logger):
         episodes = self._model.ep_info_buffer
         if episodes:
             decisions = sum(episode["l"] for episode in episodes)
-            self.record(_DECISION_REWARD, sum(episode["r"] for episode in episodes) / decisions)
+            reward = sum(episode["r"] for episode in episodes)
+            self.record(_DECISION_REWARD, reward / decisions)
         super().dump(step)
 
     def end_episodes(self, step: int) -> None:

@@ -119,8 +119,8 @@ class TrainConfig(CodeNamingModel):
     def _check_critic(self) -> Self:
         if self.critic_sees and self.algorithm in ("SAC", CONSTANTS):
             raise ValueError(
-                f"critic_sees is for PPO and A2C, whose critic has inputs of its own, got"
-                f" {self.algorithm}; leave it out"
+                "critic_sees is for PPO and A2C, whose critic has inputs of its own,"
+                f" got {self.algorithm}; leave it out"
             )
         return self
 
@@ -209,8 +209,7 @@ def training_worlds(
         for scenario, _ in shares
     ]
     weights = [config.weights.get(scenario, 1.0) for scenario, _ in shares]
-    sizes = [count for _, count in shares]
-    worlds = mixed_env(conditions, sizes, threads, weights)
+    worlds = mixed_env(conditions, [count for _, count in shares], threads, weights)
     base = baselines.make(config.base, worlds, **config.base_options)
     settings = config.settings.model_dump()
     mode = AutoresetMode.SAME_STEP

@@ -139,9 +139,9 @@ class Trainer(ABC):
         if self._checkpoint_decisions is None:
             state = f"no checkpoint was due yet (checkpoint_every: {self.config.checkpoint_every})"
         return (
-            f"{quantity} is not a finite number at decision {self.done} of training seed"
-            f" {self._seed}; {state}; start again with a smaller learning_rate or log_std_init, or"
-            " smaller weights of the reward"
+            f"{quantity} is not a finite number at decision {self.done} of training"
+            f" seed {self._seed}; {state}; start again with a smaller learning_rate or"
+            " log_std_init, or smaller weights of the reward"
         )
 
     @abstractmethod
@@ -173,7 +173,8 @@ class Trainer(ABC):
         current = self._keep_policy("current")
         columns = [column.metric for column in environment(self.config.env).judged]
         if self._base is None:
-            self._base = play_scenarios(self.config, self.config.base, columns, self._threads)
+            policy = self.config.base
+            self._base = play_scenarios(self.config, policy, columns, self._threads)
         base, base_failed = self._base
         mine, failed = self._base
         if self.done > 0:
@@ -263,7 +264,7 @@ def play_scenarios(
     }
     results = [evaluations[scenario] for scenario in config.scenarios]
     means = [
-        [np.mean(values) if len(values) else np.nan for values in map(result.values, metrics)]
+        [np.mean(v) if len(v) else np.nan for v in map(result.values, metrics)]
         for result in results
     ]
     return np.array(means), np.array([result.num_failed for result in results])

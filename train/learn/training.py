@@ -89,7 +89,8 @@ class Training(Trainer):
         TensorBoard's thread ends with the training, also after an error.
         """
         with hide_thread_errors():
-            logger = RewardLogger(str(self.folder / "tensorboard"), self.model, self._worlds)
+            folder = str(self.folder / "tensorboard")
+            logger = RewardLogger(folder, self.model, self._worlds)
             self.model.set_logger(logger)
             self._logger = logger
             try:
@@ -111,7 +112,7 @@ class Training(Trainer):
             rate = self._learning_rate * (1.0 - before / self.config.decisions)
             self.model.lr_schedule = lambda _: rate
         decisions = self.config.worlds
-        if not isinstance(self.model, OffPolicyAlgorithm):  # n_steps of SAC is that of returns
+        if not isinstance(self.model, OffPolicyAlgorithm):  # its n_steps is that of returns
             decisions *= self.model.n_steps
         try:
             self.model.learn(decisions, reset_num_timesteps=before == 0, log_interval=1)
@@ -171,8 +172,8 @@ class Training(Trainer):
         model = self.model
         for name, value in state["model"].items():
             setattr(model, name, value)
-        for statistics, values in zip(self._statistics, state["statistics"], strict=True):
-            statistics.mean, statistics.var, statistics.count = values
+        for rms, values in zip(self._statistics, state["statistics"], strict=True):
+            rms.mean, rms.var, rms.count = values
         self._best = state["best"]
         np.random.set_state(tuple(state["numpy"]))  # noqa: NPY002
         random.setstate(_lists_to_tuples(state["python"]))

@@ -7,17 +7,22 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from train.evaluate import terms
+from train.evaluate import change_text
+from train.evaluate.change_text import percent_interval, signed_interval
 from train.evaluate.changes import Change, group_lines
 from train.evaluate.episodes import group_by
 from train.evaluate.maps import HeatMap
 from train.evaluate.statistics import Estimate, named_intervals
-from train.evaluate.terms import percent_interval, signed_interval
 from train.report.tables import Cell, Head, Part, Row, Table, number_interval
 from train.report.terminal import print_table
 from train.runs.escaping import write_records
 
-_SIGNS = {"°": terms.HELD_OUT, "(°)": terms.PARTLY, "†": terms.CEILING, "‡": terms.SAME_ROBOT}
+_SIGNS = {
+    "°": change_text.HELD_OUT,
+    "(°)": change_text.PARTLY,
+    "†": change_text.CEILING,
+    "‡": change_text.SAME_ROBOT,
+}
 """Marks by the signs that stand for them on a terminal."""
 _MAX_LINES = 40
 """Largest number of changes of policies without training on a terminal."""
@@ -73,7 +78,7 @@ def cells_table(rows: Sequence[Change]) -> Table:
         keys=len(names),
         title=f"change against {_opponent(rows)} on the same episodes, {_statistic(rows)}",
         subjects=policies if is_one else (),
-        caption=". ".join([*(f"{sign} {_SIGNS[sign]}" for sign in signs), terms.SIGNS_ARE]),
+        caption=". ".join([*(f"{sign} {_SIGNS[sign]}" for sign in signs), change_text.SIGNS_ARE]),
     )
 
 
@@ -116,7 +121,7 @@ def _scope(row: Change) -> tuple[Part, ...]:
     if row.is_group:
         parts.append(Part("pooled", "pooled", before=" "))
     for mark in row.marks:
-        parts.append(Part(mark, "ceiling" if mark == terms.CEILING else "badge", before=" "))
+        parts.append(Part(mark, "ceiling" if mark == change_text.CEILING else "badge", before=" "))
     return tuple(parts)
 
 
@@ -145,7 +150,7 @@ def _opponent(rows: Sequence[Change]) -> str:
         return rows[0].base
     if not rows[0].is_rival:
         return "the base"
-    return f"{', '.join(dict.fromkeys(row.base for row in rows))} ({terms.BEST_ANALYTIC})"
+    return f"{', '.join(dict.fromkeys(row.base for row in rows))} ({change_text.BEST_ANALYTIC})"
 
 
 def _signs(marks: Sequence[str]) -> list[str]:
@@ -167,7 +172,7 @@ def write_statistics(rows: Sequence[Change], path: Path) -> Path:
 
 
 def _record(row: Change, swept: Sequence[str]) -> dict[str, object]:
-    opponent = terms.BEST_ANALYTIC if row.is_rival else "base of the residual"
+    opponent = change_text.BEST_ANALYTIC if row.is_rival else "base of the residual"
     return {
         "policy": row.policy,
         "base": row.base,

@@ -13,12 +13,12 @@ from rich.console import Console
 from baselines.catalogue import Track
 from elastic_env.core.errors import ConfigurationError, shorten
 from elastic_env.core.files import write_whole
+from train.evaluate.change_text import BEST_ANALYTIC, SIGNS_ARE, signed_interval
 from train.evaluate.environments import Column
 from train.evaluate.episodes import group_by
-from train.evaluate.maps import best_of
-from train.evaluate.standings import PairedChange, Standing
+from train.evaluate.leaderboard_rows import PairedChange, Standing
+from train.evaluate.scores import best_of
 from train.evaluate.statistics import Estimate
-from train.evaluate.terms import BEST_ANALYTIC, SIGNS_ARE, signed_interval
 from train.report.page import TEXTS, Page
 from train.report.report_text import capital
 from train.report.tables import Head, Part, Row, Table

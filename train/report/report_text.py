@@ -10,19 +10,19 @@ from typing import Any, Literal
 
 import pandas as pd
 
-from train.evaluate import terms
+from train.evaluate import change_text
+from train.evaluate.change_text import BEST_ANALYTIC
 from train.evaluate.changes import Change, Verdict
 from train.evaluate.environments import Column, Environment
 from train.evaluate.episodes import Evaluation, group_by
-from train.evaluate.maps import HeatMap, Scores, best_of, ranking
+from train.evaluate.leaderboard_rows import Standing
+from train.evaluate.maps import HeatMap
 from train.evaluate.progress import Curves, learning_curves
 from train.evaluate.residual_seeds import Origin
 from train.evaluate.robots import RobotScores
-from train.evaluate.scores import failures
-from train.evaluate.standings import Standing
+from train.evaluate.scores import Scores, best_of, failures, ranking
 from train.evaluate.statistics import Estimate
 from train.evaluate.table import EpisodeTable
-from train.evaluate.terms import BEST_ANALYTIC
 from train.figures.colours import policy_colours
 from train.report.templates import load_template
 
@@ -131,10 +131,10 @@ _MAX_CLAIMS = 4
 
 def sentences(kind: Literal["headline", "in_short", "notes"], results: Results) -> list[str]:
     """Return the paragraphs that a macro of `sentences.j2` writes about the results."""
-    kinds = (terms.HELD_OUT, terms.PARTLY, terms.CEILING, terms.SAME_ROBOT)
+    kinds = (change_text.HELD_OUT, change_text.PARTLY, change_text.CEILING, change_text.SAME_ROBOT)
     marks = {mark for row in results.changes for mark in row.marks}
     helpers = {
-        "terms": terms,
+        "change_text": change_text,
         "failures": failures,
         "ranked": _rank_policies,
         "by_metric": lambda rows: group_by(rows, lambda row: row.column).values(),

@@ -6,15 +6,15 @@ from pathlib import Path
 
 from rich.console import Console
 
+from train.evaluate.change_text import percent_interval
 from train.evaluate.changes import count_episodes_apart
 from train.evaluate.environments import Column
 from train.evaluate.episodes import group_by
 from train.evaluate.progress import Curves
 from train.evaluate.robots import RobotScores
-from train.evaluate.scores import by_episode, score
+from train.evaluate.scores import episodes_as_robots, score
 from train.evaluate.statistics import Estimate
 from train.evaluate.table import EpisodeTable
-from train.evaluate.terms import percent_interval
 from train.figures.chart import quantiles
 from train.report.tables import Head, Row, Table, number_interval
 from train.report.terminal import print_table
@@ -28,7 +28,7 @@ def scores_table(table: EpisodeTable, columns: Sequence[Column]) -> Table:
         for cell in table.cells_of(policy, reference, scenario):
             condition = table.conditions[policy, cell]
             episodes = table.rows_of(policy, cell)
-            episodes = by_episode(episodes) if condition.member is None else episodes
+            episodes = episodes_as_robots(episodes) if condition.member is None else episodes
             units = ([len(set(episodes["robot"]))], [condition.draws_robots])
             scores = [count_episodes_apart(score(episodes, column), *units) for column in columns]
             figures = map(number_interval, scores, columns)

@@ -5,7 +5,7 @@ from typing import Any
 
 from elastic_env.core.errors import missing_extra
 from train.figures.colours import NIGHT, VERDICTS
-from train.report.specs import FONT
+from train.report.plotly_charts import FONT
 from train.runs.escaping import line_value, script_json, template_value
 
 

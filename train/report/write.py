@@ -5,23 +5,23 @@ from pathlib import Path
 
 from elastic_env.core.errors import missing_extra
 from elastic_env.core.files import write_whole
+from train.evaluate.change_text import SIGNS_ARE
 from train.evaluate.environments import Column
 from train.evaluate.episodes import Evaluation, group_by
 from train.evaluate.scores import score
 from train.evaluate.statistics import Estimate
 from train.evaluate.table import EpisodeTable
-from train.evaluate.terms import SIGNS_ARE
 from train.figures.comparison_figures import group_cells, sweep_charts
 from train.figures.map_plots import panels
 from train.figures.score_charts import learning_chart
 from train.figures.time_chart import time_chart
 from train.report.change_tables import changes_table
-from train.report.charts import forest, ladder
+from train.report.dot_plots import forest, ladder
 from train.report.leaderboard import add_leaderboard
 from train.report.page import TEXTS, Page
+from train.report.plotly_charts import page_chart
 from train.report.report_text import Results, capital, facts, sentences
 from train.report.score_tables import learning_table, robots_table, scores_table
-from train.report.specs import page_chart
 from train.report.summary import bound_notes
 from train.report.tables import Table
 from train.report.templates import load_template

@@ -9,10 +9,10 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
+from elastic_env.rendering import deviation_picture
+from elastic_env.rendering.deviation_picture import DeviationPicture, enlarge_deviation
 from elastic_env.rendering.picture import set_stage
 from elastic_env.rendering.side_by_side import DisplayRobot, Sides
-from elastic_env.robots import deviations
-from elastic_env.robots.deviations import DeviationPicture, enlarge_deviation
 from elastic_env.robots.testbed.model import Pendulum
 
 _SHAPES = Path(__file__).with_suffix(".xml").read_text(encoding="utf-8")
@@ -28,9 +28,9 @@ class TestbedPicture(DeviationPicture):
     def __init__(self, pendulum: Pendulum) -> None:
         spec = _display_spec(pendulum)
         _add_light(spec)
-        set_stage(spec, deviations.WIDTH, deviations.HEIGHT)
+        set_stage(spec, deviation_picture.WIDTH, deviation_picture.HEIGHT)
         colours = {word: spec.geom(name).rgba for word, name in _LEGEND_GEOMS.items()}
-        colours["reference"] = deviations.REFERENCE_WORD_RGBA
+        colours["reference"] = deviation_picture.REFERENCE_WORD_RGBA
         super().__init__(spec, [*colours.items()])
         self._pendulum = pendulum
 

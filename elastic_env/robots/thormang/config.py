@@ -8,7 +8,6 @@ from mujoco import MjModel
 
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.errors import ConfigurationError, ElasticError
-from elastic_env.core.robot_ranges import DrawnRobot, draw_robots
 from elastic_env.core.signals import Array
 from elastic_env.joint.elasticity import ElasticJoint
 from elastic_env.joint.joint_names import JointAddresses
@@ -22,6 +21,7 @@ from elastic_env.robots.thormang.standing import Equilibrium, equilibrium
 from elastic_env.world.drawn_robot import set_joints, spring_ids, stiffest_plant
 from elastic_env.world.further_sensors import ACCELEROMETER, add_accelerometer
 from elastic_env.world.joint_config import TaskConfig
+from elastic_env.world.robot_ranges import DrawnRobot, draw_robots
 from elastic_env.world.scenario import Scenario
 
 FALL_HEIGHT_SHARE = 0.75

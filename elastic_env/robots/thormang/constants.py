@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from elastic_env.core.robot_ranges import DrawnRobot
 from elastic_env.core.signals import BoolArray
 from elastic_env.motion import walk_plan
 from elastic_env.motion.gait import RIGHT
@@ -21,6 +20,7 @@ from elastic_env.world import control_kernels as kernels
 from elastic_env.world.foot_sensors import FootSensors
 from elastic_env.world.records import Records, single_record
 from elastic_env.world.robot_model import WalkerModel
+from elastic_env.world.robot_ranges import DrawnRobot
 from elastic_env.world.sensors import is_due
 
 _STEPS_BEFORE_SKIP = 2

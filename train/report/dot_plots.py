@@ -5,16 +5,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from train.evaluate.change_text import CEILING, HELD_OUT, percent_interval
 from train.evaluate.changes import Change, group_lines
 from train.evaluate.environments import Column
 from train.evaluate.episodes import group_by
 from train.evaluate.scores import failures, score
 from train.evaluate.statistics import Estimate
 from train.evaluate.table import EpisodeTable
-from train.evaluate.terms import CEILING, HELD_OUT, percent_interval
 from train.figures.colours import INK, LINE, VERDICTS
-from train.report import specs
-from train.report.specs import LONGEST_NAME, Spec, base_axis
+from train.report import plotly_charts
+from train.report.plotly_charts import LONGEST_NAME, Spec, base_axis
 from train.report.tables import number_interval
 from train.runs.escaping import chart_text
 
@@ -57,17 +57,17 @@ def _dot_plot(
         height: Height of the chart [px].
         top: Margin at the top [px].
     """
-    layout = specs.base_layout(left=left, top=top, bottom=10)
+    layout = plotly_charts.base_layout(left=left, top=top, bottom=10)
     data: list[Spec] = []
     for number, (axis, dots) in enumerate(panels):
-        x = f"x{specs.nth(number)}"
+        x = f"x{plotly_charts.nth(number)}"
         known = [dot for dot in dots if dot.estimate.is_known]
         for colour, group in group_by(known, lambda dot: dot.colour).items():
             data.append(_points(group, colour, x))
         texts = {
             "type": "scatter",
             "mode": "text",
-            "x": [specs.digits(dot.text_x) for dot in dots],
+            "x": [plotly_charts.digits(dot.text_x) for dot in dots],
             "y": [dot.row for dot in dots],
             "xaxis": x,
             "text": [f"  {dot.text}" for dot in dots],
@@ -77,8 +77,8 @@ def _dot_plot(
             "cliponaxis": False,
         }
         data.append(texts)
-        domain = specs.domain(number, len(panels), gap=0.03)
-        layout[f"xaxis{specs.nth(number)}"] = {
+        domain = plotly_charts.domain(number, len(panels), gap=0.03)
+        layout[f"xaxis{plotly_charts.nth(number)}"] = {
             **axis,
             "domain": domain,
             "anchor": "y",
@@ -102,9 +102,9 @@ def _points(dots: Sequence[Dot], colour: str, x: str) -> Spec:
         "type": "scatter",
         "mode": "markers",
         "xaxis": x,
-        "x": [specs.digits(dot.estimate.value) for dot in dots],
+        "x": [plotly_charts.digits(dot.estimate.value) for dot in dots],
         "y": [dot.row for dot in dots],
-        "error_x": specs.error_bars([dot.estimate for dot in dots], colour),
+        "error_x": plotly_charts.error_bars([dot.estimate for dot in dots], colour),
         "marker": {"size": 9, "color": colour, "symbol": symbols, "line": outline},
         "hoverinfo": "x+text",
         "hovertext": [chart_text(dot.name) for dot in dots],
@@ -143,7 +143,7 @@ def ladder(table: EpisodeTable, reference: str, colours: Mapping[str, str]) -> S
             dots.append(Dot(row, shown, text, text_x, policy, colours[policy], symbol))
         panels.append((axis, dots))
     chart = _dot_plot(
-        {row: chart_text(specs.cut_name(policy)) for row, policy, _ in rungs},
+        {row: chart_text(plotly_charts.cut_name(policy)) for row, policy, _ in rungs},
         panels,
         left=8 * min(max(map(len, table.policies)), LONGEST_NAME) + 24,
         height=70 + (24 if len(rungs) < 40 else 19) * (place + 1.0),

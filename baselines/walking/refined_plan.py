@@ -32,7 +32,8 @@ def refine_model(model: WalkerModel) -> WalkerModel:
     Raises:
         ElasticError: A foot is out of reach on the refined plan.
     """
-    return replace(model, plan=refine_plan(model.plan, model.biped, model.control_period_s))
+    plan = refine_plan(model.plan, model.biped, model.control_period_s)
+    return replace(model, plan=plan)
 
 
 class RefinedWalk(PassingMemory):

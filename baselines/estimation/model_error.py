@@ -98,7 +98,8 @@ class BendingObserver:
         measured, expected = self.disagreement(rows, bending)
         memory = memory.copy()
         estimates = np.empty((len(rows), len(self.signals)))
-        regress(self._view.fields(rows), measured, expected, self.carried, memory, estimates)
+        observations = self._view.fields(rows)
+        regress(observations, measured, expected, self.carried, memory, estimates)
         return estimates, memory
 
     def bending(self, rows: Array) -> Array:
@@ -164,7 +165,7 @@ def regress(
 
 @compiled_part
 def update(x: Array, P: Array, expected: float, measured: float, sigma: float) -> None:
-    """Update by a measurement of (expected, 1) · x = measured − expected, with its deviation."""
+    """Update by a measurement of (expected, 1) · x = measured − expected, of deviation sigma."""
     first = P[0] * expected + P[1]
     second = P[1] * expected + P[2]
     variance = (expected * first + second) + sigma**2

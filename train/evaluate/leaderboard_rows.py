@@ -9,8 +9,7 @@ from elastic_env.core.errors import ConfigurationError
 from train.evaluate.changes import change_of
 from train.evaluate.environments import Column
 from train.evaluate.episodes import Evaluation, group_by
-from train.evaluate.maps import best_of
-from train.evaluate.scores import failures, score
+from train.evaluate.scores import best_of, failures, score
 from train.evaluate.statistics import Estimate
 from train.evaluate.table import EpisodeTable, Groups, Scope
 
@@ -94,8 +93,8 @@ def append_standings(published: Sequence[Standing], own: Sequence[Standing]) -> 
     if theirs.keys() != ours.keys():
         there, here = (" and ".join(origins) or "nothing" for origins in (theirs, ours))
         raise ConfigurationError(
-            "published rows and your own must have the same version and protocol, got"
-            f" {there or 'an unknown version'} and {here}; the protocol is motions, scenarios,"
+            "published rows and your own must have the same version and protocol, got published"
+            f" {there or 'an unknown version'} and own {here}; the protocol is motions, scenarios,"
             " groups, episodes and seed"
         )
     policies = {row.policy for row in published}

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 import baselines
 import elastic_env  # noqa: F401  registers the environments
-from baselines.estimation.bending import (
+from baselines.estimation.model_error import (
     DISAGREEMENT_RAD,
     MODEL_ERROR,
     OFFSET_RAD,
