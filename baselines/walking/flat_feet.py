@@ -73,7 +73,7 @@ class FlatFeet:
 def ground_reaction(
     feet: Any, plan: Any, observations: Any, wrench: Array, force: Array, error: Array
 ) -> None:
-    """Fill in the values of `FlatFeet.ground`, as `compute_zmp` in the control kernels.
+    """Fill in the values of `FlatFeet.ground`, by the equation of `compute_zmp`.
 
     Args:
         feet: Feet of the walker, a row, (1,).
