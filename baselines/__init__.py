@@ -6,8 +6,7 @@ action, state = policy.predict(observation)
 """
 
 import elastic_env  # noqa: F401  first: it chooses MuJoCo's OpenGL before anything imports MuJoCo
-from baselines.compensation.compensated import Compensated
-from baselines.compensation.compensators import GravityCompensator
+from baselines.compensation.compensators import Compensated, GravityCompensator
 from baselines.compensation.dynamic_compensator import DynamicCompensator
 from baselines.compensation.policy import Policy
 from baselines.compensation.position_compensator import PositionCompensator

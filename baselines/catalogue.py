@@ -16,8 +16,7 @@ from baselines.adaptation.estimators import LegEstimator, make_estimator
 from baselines.adaptation.iterative import IterativeLearner
 from baselines.adaptation.learned_signals import learned_signals
 from baselines.adaptation.online_stiffness import OnlineStiffness
-from baselines.compensation.compensated import Compensated
-from baselines.compensation.compensators import GravityCompensator
+from baselines.compensation.compensators import Compensated, GravityCompensator
 from baselines.compensation.dynamic_compensator import DynamicCompensator
 from baselines.compensation.measured import (
     LINK_ENCODER,

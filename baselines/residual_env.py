@@ -17,8 +17,7 @@ from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
-from baselines.compensation.memory import put_rows, select_rows
-from baselines.compensation.policy import Policy
+from baselines.compensation.policy import Policy, put_rows, select_rows
 from baselines.policies import make
 from baselines.residual.correction import Corrected
 from baselines.residual.features import Features, FeaturesMemory

@@ -36,7 +36,7 @@ KERNELS = (
     "elastic_env.rigid.tree.kernels",
     "baselines.compensation.dynamic_compensator",
     "baselines.compensation.contact_torque",
-    "baselines.walking.control_kernel",
+    "baselines.walking.controller",
     "baselines.walking.dcm_observer",
     "baselines.walking.flat_feet",
     "baselines.walking.standing_estimate",

@@ -17,7 +17,7 @@ from baselines.compensation.compensators import GravityCompensator, taylor_link_
 from baselines.compensation.contact_torque import PlannedTorque, WrenchTorque, gravity_in_pelvis
 from baselines.compensation.dynamic_compensator import DynamicCompensator
 from baselines.compensation.gravity_torque import GravityModel, make_gravity
-from baselines.compensation.observation_view import Motion
+from baselines.compensation.policy import Motion
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
 from elastic_env.joint.joint_names import JointAddresses

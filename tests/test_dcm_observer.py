@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 import baselines
-from baselines.compensation.policy import PolicyInputs
-from baselines.compensation.records import record_row
+from baselines.compensation.policy import PolicyInputs, record_row
 from baselines.walking.dcm_observer import (
     OBSERVED,
     DcmObserver,

@@ -8,7 +8,7 @@ import pytest
 from gymnasium.vector import AutoresetMode
 
 import baselines
-from baselines.compensation.memory import select_rows
+from baselines.compensation.policy import select_rows
 from baselines.residual.correction import Corrected
 from baselines.residual.features import Features
 from baselines.residual.residual_policy import ResidualPolicy

@@ -24,7 +24,7 @@ from baselines.residual.residual_folder import read_description, shipped_names
 from baselines.residual.residual_policy import ResidualPolicy
 from baselines.residual.settings import ResidualSettings
 from baselines.residual_env import ResidualVectorWrapper
-from baselines.walking.control_kernel import follow_zmp
+from baselines.walking.controller import follow_zmp
 from baselines.walking.zmp_shift import Stances, following_share, move_pelvis
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array

@@ -8,7 +8,7 @@ import pytest
 
 import baselines
 import elastic_env  # noqa: F401  registers the environments
-from baselines.compensation.compensated import Compensated
+from baselines.compensation.compensators import Compensated
 from baselines.compensation.dynamic_compensator import DynamicCompensator
 from baselines.compensation.policy import PolicyInputs, Zero
 from baselines.walking.controller import WalkingController

@@ -38,7 +38,7 @@ from baselines.compensation.compensators import GravityCompensator
 from baselines.compensation.dry_friction import presliding_friction
 from baselines.compensation.gravity_torque import make_gravity
 from baselines.compensation.measured import DeflectionSensors
-from baselines.compensation.observation_view import ObservationView
+from baselines.compensation.policy import ObservationView
 from baselines.estimation.model_error import BendingObserver
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array, SignalTable

@@ -17,8 +17,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from baselines.compensation.observation_view import ObservationView, WalkView
-from baselines.compensation.records import record_row, record_rows
+from baselines.compensation.policy import ObservationView, WalkView, record_row, record_rows
 from elastic_env.core.compiled import compiled, compiled_part
 from elastic_env.core.signals import Array
 from elastic_env.motion.walk_plan import WalkPlan

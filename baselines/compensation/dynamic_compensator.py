@@ -15,8 +15,7 @@ from baselines.compensation.compensators import (
 from baselines.compensation.contact_torque import PlannedTorque
 from baselines.compensation.dry_friction import FrictionCompensation, FrictionMemory
 from baselines.compensation.gravity_torque import GravityMethod, make_gravity
-from baselines.compensation.observation_view import Motion
-from baselines.compensation.records import record_rows
+from baselines.compensation.policy import Motion, record_rows
 from elastic_env.core.compiled import compiled, compiled_part
 from elastic_env.core.signals import Array, Parameter
 from elastic_env.joint.elasticity import static_deflection

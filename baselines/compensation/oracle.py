@@ -10,10 +10,9 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from typing_extensions import override
 
-from baselines.compensation.compensated import Compensated
+from baselines.compensation.compensators import Compensated
 from baselines.compensation.dynamic_compensator import DriveMemory, DynamicCompensator
-from baselines.compensation.observation_view import Motion
-from baselines.compensation.policy import PassingMemory, Policy, PolicyInputs, Step
+from baselines.compensation.policy import Motion, PassingMemory, Policy, PolicyInputs, Step
 from baselines.compensation.startup import Ramp
 from elastic_env.core.errors import ElasticError
 from elastic_env.core.signals import Array, IntArray

@@ -13,7 +13,6 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 
 from baselines.compensation.inputs import COMMAND, INPUTS, InputKind, input_signals, inputs_of
-from baselines.compensation.memory import resume_memory
 from baselines.compensation.policy import (
     NO_INPUTS,
     ONE_WORLD,
@@ -21,6 +20,7 @@ from baselines.compensation.policy import (
     Step,
     as_action,
     as_batch_policy,
+    resume_memory,
 )
 from baselines.residual.settings import ResidualSettings
 from elastic_env.core.errors import ConfigurationError, unknown_name

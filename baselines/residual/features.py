@@ -23,8 +23,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from baselines.compensation.memory import put_rows, select_rows
-from baselines.compensation.observation_view import ObservationView
+from baselines.compensation.policy import ObservationView, put_rows, select_rows
 from baselines.estimation.ground_level import GroundLevel, GroundMemory
 from baselines.estimation.model_error import BendingObserver
 from baselines.residual.correction import Corrected

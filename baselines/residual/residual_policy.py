@@ -8,8 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from typing_extensions import override
 
-from baselines.compensation.memory import put_rows, select_rows
-from baselines.compensation.policy import BatchPolicy, PolicyInputs, Step
+from baselines.compensation.policy import BatchPolicy, PolicyInputs, Step, put_rows, select_rows
 from baselines.residual.correction import Corrected, CorrectedMemory
 from baselines.residual.features import Features, FeaturesMemory
 from baselines.residual.network import Network

@@ -30,9 +30,15 @@ import numpy as np
 from typing_extensions import override
 
 from baselines.compensation.filters import filter_share
-from baselines.compensation.observation_view import WalkView
-from baselines.compensation.policy import MemoryAround, PolicyAround, PolicyInputs, Step
-from baselines.compensation.records import record_row, record_rows
+from baselines.compensation.policy import (
+    MemoryAround,
+    PolicyAround,
+    PolicyInputs,
+    Step,
+    WalkView,
+    record_row,
+    record_rows,
+)
 from baselines.compensation.startup import feedback_ramp
 from baselines.walking.flat_feet import LEAST_LOAD, FlatFeet
 from elastic_env.core.compiled import compiled, record_type

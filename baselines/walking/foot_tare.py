@@ -12,9 +12,14 @@ from typing import Any
 import numpy as np
 from typing_extensions import override
 
-from baselines.compensation.observation_view import WalkView
-from baselines.compensation.policy import MemoryAround, PolicyAround, PolicyInputs, Step
-from baselines.compensation.records import record_row
+from baselines.compensation.policy import (
+    MemoryAround,
+    PolicyAround,
+    PolicyInputs,
+    Step,
+    WalkView,
+    record_row,
+)
 from elastic_env.core.compiled import compiled, record_type
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array

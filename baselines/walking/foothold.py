@@ -28,9 +28,15 @@ from typing import Any
 import numpy as np
 from typing_extensions import override
 
-from baselines.compensation.observation_view import WalkView
-from baselines.compensation.policy import MemoryAround, PolicyAround, PolicyInputs, Step
-from baselines.compensation.records import record_row, record_rows
+from baselines.compensation.policy import (
+    MemoryAround,
+    PolicyAround,
+    PolicyInputs,
+    Step,
+    WalkView,
+    record_row,
+    record_rows,
+)
 from baselines.walking.zmp_offset import IN_PLANE
 from baselines.walking.zmp_shift import Stances, move_feet
 from elastic_env.core.compiled import compiled, compiled_part, record_type

@@ -28,9 +28,14 @@ import numpy as np
 from typing_extensions import override
 
 from baselines.compensation.filters import filter_share
-from baselines.compensation.observation_view import WalkView
-from baselines.compensation.policy import MemoryAround, PolicyAround, PolicyInputs, Step
-from baselines.compensation.records import record_row
+from baselines.compensation.policy import (
+    MemoryAround,
+    PolicyAround,
+    PolicyInputs,
+    Step,
+    WalkView,
+    record_row,
+)
 from baselines.compensation.startup import Ramp
 from elastic_env.core.compiled import compiled, compiled_part, record_type
 from elastic_env.core.config import Model, quantity

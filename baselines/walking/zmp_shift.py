@@ -29,7 +29,7 @@ import numpy as np
 from scipy import linalg
 
 from baselines.compensation.contact_torque import cosine_and_sine
-from baselines.compensation.records import record_row, record_rows
+from baselines.compensation.policy import record_row, record_rows
 from elastic_env.core.compiled import compiled, compiled_part
 from elastic_env.core.signals import Array
 from elastic_env.rigid.leg_kinematics import LegGeometry, turn

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from baselines.adaptation.estimators import ASSUMED_LOADS
-from baselines.compensation.compensated import Compensated
+from baselines.compensation.compensators import Compensated
 from baselines.compensation.contact_torque import ContactGravity
 from baselines.estimation import model_error
 from elastic_env.core.signals import Array

@@ -6,8 +6,7 @@ import numpy as np
 
 from baselines.adaptation.estimators import LegEstimator
 from baselines.adaptation.online_stiffness import OnlineStiffness
-from baselines.compensation.compensated import Compensated
-from baselines.compensation.compensators import GravityCompensator
+from baselines.compensation.compensators import Compensated, GravityCompensator
 from baselines.walking.controller import WalkingController
 from baselines.walking.posture import PostureFeedback
 from elastic_env.core.errors import ConfigurationError
