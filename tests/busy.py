@@ -10,6 +10,7 @@ once_more = pytest.mark.flaky(
         "not confirmed by servo",
         "no command for",
         "too slow: set",
+        "did not answer within",
     ],
 )
 """At times it lets no process run for 40 ms or more: replies and commands are missing, which
