@@ -37,7 +37,7 @@ from tests.hardware_trials import trials as hardware_trials
 from tests.hardware_trials.__main__ import prove
 from train.commands.cli import main
 from train.commands.identify import Identify, JointOptions, identified_environments
-from train.commands.options import OnHardware
+from train.commands.options import HardwareOptions
 
 QUICK = {"kind": "sine", "amplitude": 0.1, "frequency_hz": 0.5, "duration_s": 0.3, "onset_s": 0.4}
 PATIENT = {"patience_cycles": 10, "hang_s": 0.09}
@@ -380,7 +380,7 @@ def test_identification_takes_the_pendulum_that_is_mounted(tmp_path: Path) -> No
     (tmp_path / "m.yaml").write_text(
         "port: /dev/a\nimu_port: /dev/b\npendulum: {gravity_torque: 52.0, mass: 8.0}\n"
     )
-    on = OnHardware(mounting=tmp_path / "m.yaml")
+    on = HardwareOptions(mounting=tmp_path / "m.yaml")
     envs = identified_environments(Identify(on=on, testbed=JointOptions(second_mass=0.5)))
     pendulums = [env.unwrapped.task.config.pendulum for env in envs]
     assert [(p.gravity_torque, p.mass) for p in pendulums] == [(52.0, 8.0), (26.0, 4.0)]
@@ -411,15 +411,15 @@ def test_commands_run_on_hardware(
     )
     options = ["--mounting", "mounting.yaml", "--imu-port", emulator.imu_port, "--yes"]
     assert (
-        OnHardware(mounting=Path("mounting.yaml"), yes=True).arguments["limits"]["slew_rad_s"]
+        HardwareOptions(mounting=Path("mounting.yaml"), yes=True).arguments["limits"]["slew_rad_s"]
         == 2.5
     )
-    patient = OnHardware(mounting=Path("mounting.yaml"), yes=True, patient=True).arguments
+    patient = HardwareOptions(mounting=Path("mounting.yaml"), yes=True, patient=True).arguments
     assert [patient["limits"][name] for name in ("patience_cycles", "slew_rad_s")] == [10, 2.5]
     assert patient["imu_oldest_s"] == 0.3  # as the file says, which is more patient still
-    assert OnHardware(port="p", yes=True, patient=True).arguments["imu_oldest_s"] == 0.2
+    assert HardwareOptions(port="p", yes=True, patient=True).arguments["imu_oldest_s"] == 0.2
     assert (
-        "pendulum" not in OnHardware(port=emulator.port, yes=True).arguments
+        "pendulum" not in HardwareOptions(port=emulator.port, yes=True).arguments
     )  # a configuration may say it
     reference = ["--reference", json.dumps(QUICK)]
     command(
@@ -454,7 +454,9 @@ def test_a_mounting_needs_no_port_of_its_own(tmp_path: Path) -> None:
     without a cure."""
     mounting = tmp_path / "mounting.yaml"
     mounting.write_text("direction: -1\n")
-    given = OnHardware(port="/dev/ttyUSB7", imu_port="/dev/ttyACM7", mounting=mounting).arguments
+    given = HardwareOptions(
+        port="/dev/ttyUSB7", imu_port="/dev/ttyACM7", mounting=mounting
+    ).arguments
     assert (given["port"], given["imu_port"], given["direction"]) == (
         "/dev/ttyUSB7",
         "/dev/ttyACM7",
@@ -470,9 +472,9 @@ def test_a_mounting_needs_no_port_of_its_own(tmp_path: Path) -> None:
     ):
         mounting.write_text(text)
         with pytest.raises(ConfigurationError, match=words):
-            _ = OnHardware(port=port, mounting=mounting).arguments
+            _ = HardwareOptions(port=port, mounting=mounting).arguments
     with pytest.raises(ConfigurationError, match="is a folder"):
-        _ = OnHardware(port="p", mounting=tmp_path).arguments
+        _ = HardwareOptions(port="p", mounting=tmp_path).arguments
 
 
 @pytest.mark.slow

@@ -60,8 +60,8 @@ class ArmProblem:
             log = empty_log(arm, options.measured_by or "end_effector")
         if options.end_effector is None and log.kind in ("end_effector", "imu"):
             console.print(
-                f"measured is taken to be {arm.end_effector!r}; --end-effector names another site"
-                " or body"
+                f"the log is taken to measure {arm.end_effector!r}; --end-effector names another"
+                " site or body"
             )
         elastic = _elastic_joints(options.joints, log.joints)
         problem = cls(options, arm, log, elastic, seed)

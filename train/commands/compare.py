@@ -10,7 +10,7 @@ from elastic_env.core.config import Locator, Model, load_yaml
 from elastic_env.core.errors import ConfigurationError
 from train.commands.compare_config import CompareConfig
 from train.commands.comparison import compare
-from train.commands.options import OnHardware, name_options
+from train.commands.options import HardwareOptions, name_options
 from train.figures.plots import FigureFormat
 from train.report.leaderboard import find_published, read_leaderboard
 from train.runs.console import print_files
@@ -71,7 +71,7 @@ class Compare(Model):
     trust_code: bool = False
     """With --resume and no configuration: run the code that the run's own names."""
     executors: Executors = Executors()
-    hardware: OnHardware = OnHardware()
+    hardware: HardwareOptions = HardwareOptions()
 
     def run(self, console: Console) -> None:
         """Run the comparison, or list the presets."""

@@ -7,7 +7,7 @@ from rich.console import Console
 from elastic_env.core.config import Model
 from train.commands.compare_config import CompareConfig
 from train.commands.comparison import compare
-from train.commands.options import MotionOrDefault, OnHardware, Stiffness, name_options
+from train.commands.options import HardwareOptions, MotionOrDefault, Stiffness, name_options
 from train.evaluate.conditions import NumEpisodes, PolicySpec, Seed
 from train.figures.plots import FigureFormat
 from train.runs.console import print_files
@@ -59,7 +59,7 @@ class Evaluate(Model):
     """Folder for the results, new or empty; default runs/evaluate, numbered if taken."""
     figure_format: FigureFormat = "png"
     """Of the figures: pdf and svg have no resolution, and png has 300 dpi."""
-    on: OnHardware = OnHardware()
+    hardware: HardwareOptions = HardwareOptions()
 
     def run(self, console: Console) -> None:
         """Run a comparison of one cell."""
@@ -69,12 +69,12 @@ class Evaluate(Model):
         with name_options(references="reference", scenarios="scenario", policies="policy"):
             config = CompareConfig(
                 name="evaluate",
-                scenarios=[self.on.scenario(self.scenario)],
+                scenarios=[self.hardware.scenario(self.scenario)],
                 policies=[PolicySpec(name=self.policy, options=options, env_options=sensors)],
                 episodes=self.episodes,
                 seed=self.seed,
                 **motion,
-                **self.on.environment(self.env),
+                **self.hardware.environment(self.env),
             )
         finished = compare(
             config, console, self.output, report=False, figure_format=self.figure_format

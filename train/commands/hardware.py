@@ -29,7 +29,7 @@ from elastic_env.robots.testbed.environment import configure_testbed
 from train.commands.hardware_arm import ArmOptions, ArmSetup
 from train.commands.hardware_arm_dry_run import emulator_config
 from train.commands.hardware_compensate import Compensate, LogPoses
-from train.commands.options import MotionOrDefault, OnHardware
+from train.commands.options import HardwareOptions, MotionOrDefault
 from train.evaluate.conditions import Condition, PolicySpec
 from train.evaluate.rollout import ControlStep, control_steps, make_policy
 from train.runs.console import make_table
@@ -135,11 +135,11 @@ class Run(Model):
     """Folder for log.csv and metrics.json, new or empty; default runs/hardware, numbered if
     taken.
     """
-    on: OnHardware = OnHardware()
+    hardware: HardwareOptions = HardwareOptions()
 
     def run(self, console: Console) -> None:
         """Play one episode and show it; log.csv has every step, also if it is cut short."""
-        if not (arguments := self.on.arguments):
+        if not (arguments := self.hardware.arguments):
             problem = "--port is needed; see: elastic hardware scan PORT, elastic hardware emulate"
             raise ConfigurationError(problem)
         spec = PolicySpec(name=self.policy)

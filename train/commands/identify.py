@@ -2,11 +2,10 @@
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Annotated, Any
+from typing import Any
 
 import gymnasium
 import pandas as pd
-import tyro
 from rich.console import Console
 from rich.table import Table
 
@@ -16,7 +15,7 @@ from elastic_env.core.errors import ConfigurationError
 from elastic_env.robots.testbed.model import Pendulum
 from train.commands.identify_arm import ArmResult, identify_arm
 from train.commands.identify_options import ArmOptions, IdentificationRun, JointOptions
-from train.commands.options import OnHardware, given_options
+from train.commands.options import HardwareOptions, given_options
 from train.figures import plots
 from train.figures.identification_plots import draw_identification
 from train.runs.console import make_table
@@ -43,7 +42,7 @@ class Identify(IdentificationRun):
     """
 
     testbed: JointOptions = JointOptions()
-    on: Annotated[OnHardware, tyro.conf.arg(name="hardware")] = OnHardware()
+    hardware: HardwareOptions = HardwareOptions()
     arm: ArmOptions = ArmOptions()
 
     def run(self, console: Console) -> list[Identification] | ArmResult | None:
@@ -59,7 +58,7 @@ class Identify(IdentificationRun):
         if self.arm == ArmOptions():
             return self._identify_testbed(console)
         unused = given_options(self.testbed, JointOptions.model_fields)
-        if self.on != OnHardware():
+        if self.hardware != HardwareOptions():
             unused.append("--port and the like")
         if unused:
             raise ConfigurationError(
@@ -70,8 +69,8 @@ class Identify(IdentificationRun):
 
     def _identify_testbed(self, console: Console) -> list[Identification]:
         plots.require_matplotlib()
-        scenario = self.on.scenario(self.testbed.scenario)
-        hardware = self.on.arguments
+        scenario = self.hardware.scenario(self.testbed.scenario)
+        hardware = self.hardware.arguments
         if hardware:
             self._require_real_joint(hardware)
         envs = identified_environments(self)
@@ -148,7 +147,7 @@ def result_table(result: Identification) -> Table:
 
 def identified_environments(options: Identify) -> list[Any]:
     """The testbed, once per mass; no port is opened yet."""
-    arguments = dict(options.on.arguments)
+    arguments = dict(options.hardware.arguments)
     pendulum = Pendulum(**arguments.pop("pendulum", {}))
     pendulums = [pendulum]
     if options.testbed.second_mass is not None:
@@ -160,7 +159,7 @@ def identified_environments(options: Identify) -> list[Any]:
         name = "elastic_env/Testbed-v0"
         arguments = {
             "num_envs": options.testbed.repeats,
-            "scenario": options.on.scenario(options.testbed.scenario),
+            "scenario": options.hardware.scenario(options.testbed.scenario),
             "stiffness": options.testbed.stiffness,
         }
     arguments["reference"] = {"kind": "hold", "positions": options.testbed.positions}

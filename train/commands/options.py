@@ -74,7 +74,7 @@ class Mounting(HardwareSettings):
     pendulum: Pendulum = Pendulum()
 
 
-class OnHardware(Model):
+class HardwareOptions(Model):
     """Options of commands that run on the simulated testbed, or with --port on a real one."""
 
     port: str | None = None
