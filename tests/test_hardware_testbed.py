@@ -380,8 +380,10 @@ def test_identification_takes_the_pendulum_that_is_mounted(tmp_path: Path) -> No
     (tmp_path / "m.yaml").write_text(
         "port: /dev/a\nimu_port: /dev/b\npendulum: {gravity_torque: 52.0, mass: 8.0}\n"
     )
-    on = HardwareOptions(mounting=tmp_path / "m.yaml")
-    envs = identified_environments(Identify(on=on, testbed=JointOptions(second_mass=0.5)))
+    hardware = HardwareOptions(mounting=tmp_path / "m.yaml")
+    envs = identified_environments(
+        Identify(hardware=hardware, testbed=JointOptions(second_mass=0.5))
+    )
     pendulums = [env.unwrapped.task.config.pendulum for env in envs]
     assert [(p.gravity_torque, p.mass) for p in pendulums] == [(52.0, 8.0), (26.0, 4.0)]
 
