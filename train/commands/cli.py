@@ -156,7 +156,7 @@ _REGISTRY = ConstructorRegistry()
 def _optional_rule(
     info: PrimitiveTypeInfo,
 ) -> PrimitiveConstructorSpec | UnsupportedTypeAnnotationError | None:
-    """Show an option without a default value as `--port STR`, where tyro has `{None}|STR`."""
+    """Show an option that may be None as `--port STR`; tyro shows `--port {None}|STR`."""
     kinds = get_args(info.type)
     if type(None) not in kinds:
         return None
