@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 import yaml
 from hypothesis import given, settings
@@ -33,7 +34,7 @@ from train.evaluate.conditions import Condition, Member, PolicySpec
 from train.evaluate.episodes import Evaluation, evaluate, merge_seeds
 from train.evaluate.progress import learning_curves
 from train.evaluate.residual_seeds import expand
-from train.evaluate.scores import pair, score
+from train.evaluate.scores import match_episodes, pair, score
 from train.evaluate.statistics import (
     Estimate,
     beats,
@@ -108,28 +109,27 @@ def test_pairs_are_found_by_the_seed_of_the_episode() -> None:
     """Catches pairing by position: shuffled episodes belong together as before."""
     mine = records([1.0, 2.0, 3.0])
     base = records([10.0, 20.0, 30.0])
-    shuffled = pair(episode_rows([mine[2], mine[0], mine[1]]), episode_rows(base), METRIC)
+    shuffled = paired(episode_rows([mine[2], mine[0], mine[1]]), episode_rows(base))
     np.testing.assert_array_equal(shuffled["mine"] / shuffled["base"], [0.1, 0.1, 0.1])
     with pytest.raises(ValueError, match="seed of its own"):
-        pair(episode_rows([*mine, mine[0]]), episode_rows(base), METRIC)
+        match_episodes(episode_rows([*mine, mine[0]]), episode_rows(base))
     with pytest.raises(ValueError, match="seed of its own"):
-        pair(episode_rows(mine), episode_rows([*base, base[0]]), METRIC)
+        match_episodes(episode_rows(mine), episode_rows([*base, base[0]]))
+
+
+def paired(mine: pd.DataFrame, base: pd.DataFrame) -> pd.DataFrame:
+    """The metric in the episodes of both."""
+    return pair(mine, match_episodes(mine, base), METRIC).dropna()
 
 
 def test_an_episode_in_which_either_fell_is_left_out_of_both() -> None:
     """Catches a fall that is averaged in, and a base that is averaged over other episodes than
     the policy."""
-    found = pair(
-        episode_rows(records([1.0, None, 3.0, 4.0])),
-        episode_rows(records([2.0, 2.0, None, 8.0])),
-        METRIC,
-    )
-    found = found.dropna()
+    mine = episode_rows(records([1.0, None, 3.0, 4.0]))
+    found = paired(mine, episode_rows(records([2.0, 2.0, None, 8.0])))
     assert (found["mine"].tolist(), found["base"].tolist()) == ([1.0, 4.0], [2.0, 8.0])
-    only_here = pair(
-        episode_rows(records([1.0, 2.0])), episode_rows(records([2.0, 4.0], first=1)), METRIC
-    )
-    only_here = only_here.dropna()
+    mine = episode_rows(records([1.0, 2.0]))
+    only_here = paired(mine, episode_rows(records([2.0, 4.0], first=1)))
     assert (only_here["mine"].tolist(), only_here["base"].tolist()) == ([2.0], [2.0])
 
 
@@ -885,7 +885,7 @@ def test_words_are_whole_where_there_are_two_residuals() -> None:
         text = console.export_text()
         assert {"learned", "residual", "reference", "scenario", "payload"} <= set(text.split())
         assert "0/2 (0/1)" in text  # the last column
-        hint = "no room for ZMP deviation rms: widen the terminal, or see statistics.csv"
+        hint = "no room for 'ZMP deviation rms': widen the terminal, or see statistics.csv"
         assert (hint in " ".join(text.split())) != has_room
 
 

@@ -4,10 +4,10 @@ A residual is compared with its base and with the best policy without learning. 
 compared with the base of the residuals, or without residuals with the first policy.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import compress
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
@@ -20,6 +20,7 @@ from train.evaluate.scores import (
     EpisodesByRobot,
     episodes_as_robots,
     failures,
+    match_episodes,
     means_of_cells,
     pair,
 )
@@ -177,25 +178,28 @@ def changes(evaluations: Sequence[Evaluation], groups: Groups | None = None) -> 
     """
     table = EpisodeTable(evaluations)
     environment = table.environment
+    columns = (*environment.judged, *environment.also)
     return [
-        change_of(table, scope, base, column)
+        row
         for title, others in opponents(table).items()
         for base in others
         if base in table.policies
         for scope in table.scopes(title, groups or {})
         if len(table.cells_of_base(scope, base)) == len(scope.cells)
-        for column in (*environment.judged, *environment.also)
+        for row in changes_of(table, scope, base, columns)
     ]
 
 
-def change_of(table: EpisodeTable, scope: Scope, base: str, column: Column) -> Change:
-    """The change of a policy against another one in one metric.
+def changes_of(
+    table: EpisodeTable, scope: Scope, base: str, columns: Iterable[Column]
+) -> list[Change]:
+    """The changes of a policy against another one, one per metric.
 
     Args:
         table: All episodes.
         scope: Policy and cells; over several cells the means are pooled.
         base: Title of the other policy, which plays in all of these cells.
-        column: The metric.
+        columns: The metrics.
 
     Raises:
         ValueError: A seed occurs twice, so that episodes cannot be paired.
@@ -209,9 +213,41 @@ def change_of(table: EpisodeTable, scope: Scope, base: str, column: Column) -> C
     base_rows = pd.concat(
         [table.rows_of(base, other).assign(cell=cell) for other, cell in cell_pairs]
     )
-    pairs = EpisodesByRobot(pair(rows, base_rows, column.metric))
-    own_values = pairs.figures("mine")
-    base_values = pairs.figures("base")
+    matched = match_episodes(rows, base_rows)
+    robots = EpisodesByRobot(rows)
+    falls, episodes = failures(rows)
+    base_falls, base_episodes = failures(base_rows)
+    marks = training_marks(table.families.get(scope.policy), scope.conditions)
+    return [
+        Change(
+            **vars(scope),
+            **_paired_figures(robots, pair(rows, matched, column.metric), is_drawn),
+            base=base,
+            marks=marks,
+            column=column,
+            is_judged=column in table.environment.judged,
+            falls=falls,
+            episodes=episodes,
+            base_falls=base_falls,
+            base_episodes=base_episodes,
+            is_rival=member is not None and base == member.rival,
+        )
+        for column in columns
+    ]
+
+
+def _paired_figures(
+    by_robot: EpisodesByRobot, pairs: pd.DataFrame, is_drawn: Sequence[bool]
+) -> dict[str, Any]:
+    """Figures of a `Change` from the pairs of one metric.
+
+    Args:
+        by_robot: Groups the pairs.
+        pairs: As `pair` returns them.
+        is_drawn: True for every cell that draws robots.
+    """
+    own_values = by_robot.figures(pairs["mine"])
+    base_values = by_robot.figures(pairs["base"])
     robots = [values.shape[1] for values in own_values]
     once = [np.ones((1, number)) for number in robots]
     own_means = means_of_cells(own_values, once)[:, 0].T
@@ -222,29 +258,17 @@ def change_of(table: EpisodeTable, scope: Scope, base: str, column: Column) -> C
         return change(*sides).T
 
     won, played = (
-        [np.nan_to_num(values) for values in pairs.figures("won", statistic)]
+        [np.nan_to_num(values) for values in by_robot.figures(pairs["won"], statistic)]
         for statistic in ("sum", "count")
     )
-    falls, episodes = failures(rows)
-    base_falls, base_episodes = failures(base_rows)
-    return Change(
-        **vars(scope),
-        base=base,
-        marks=training_marks(table.families.get(scope.policy), scope.conditions),
-        column=column,
-        is_judged=column in table.environment.judged,
-        per_seed=change(own_means, base_means),
-        relative=count_episodes_apart(estimate(relative, robots), robots, is_drawn),
-        improvement=count_episodes_apart(improvement(won, played), robots, is_drawn),
-        mine=_mean_over_seeds(own_means),
-        theirs=_mean_over_seeds(base_means),
-        num_pairs=int(sum(values.sum() for values in played)),
-        falls=falls,
-        episodes=episodes,
-        base_falls=base_falls,
-        base_episodes=base_episodes,
-        is_rival=member is not None and base == member.rival,
-    )
+    return {
+        "per_seed": change(own_means, base_means),
+        "relative": count_episodes_apart(estimate(relative, robots), robots, is_drawn),
+        "improvement": count_episodes_apart(improvement(won, played), robots, is_drawn),
+        "mine": _mean_over_seeds(own_means),
+        "theirs": _mean_over_seeds(base_means),
+        "num_pairs": int(sum(values.sum() for values in played)),
+    }
 
 
 def count_episodes_apart(

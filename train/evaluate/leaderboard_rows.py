@@ -6,7 +6,7 @@ from itertools import chain
 
 from baselines.catalogue import Track
 from elastic_env.core.errors import ConfigurationError
-from train.evaluate.changes import change_of
+from train.evaluate.changes import changes_of
 from train.evaluate.environments import Column
 from train.evaluate.episodes import Evaluation, group_by
 from train.evaluate.scores import best_of, failures, score
@@ -170,7 +170,7 @@ def _paired_change(
     """Change of a policy against another one; None if that one does not play the same cells."""
     if len(table.cells_of_base(scope, opponent)) < len(scope.cells):
         return None
-    row = change_of(table, scope, opponent, column)
+    (row,) = changes_of(table, scope, opponent, [column])
     return PairedChange(opponent, row.relative, row.verdict)
 
 

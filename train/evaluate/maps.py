@@ -16,7 +16,7 @@ from baselines.policy_options import PolicyOptions
 from elastic_env.core.config import MOST_ENTRIES, Model, Once, Title
 from elastic_env.core.errors import ConfigurationError, choices_listed, quote
 from elastic_env.world.scenario import GROUNDS
-from train.evaluate.changes import Change, change_of
+from train.evaluate.changes import Change, changes_of
 from train.evaluate.conditions import (
     HALF_WIDTH,
     SCENARIO,
@@ -250,7 +250,7 @@ def _map_cell(table: EpisodeTable, cell: int, column: Column) -> MapCell:
         best=best_of({title: scores[title] for title in without_truth}),
         best_analytic=analytic,
         learned={
-            title: change_of(table, table.scope(title, cell), str(analytic), column)
+            title: changes_of(table, table.scope(title, cell), str(analytic), [column])[0]
             for title in learned
         },
     )

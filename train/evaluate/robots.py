@@ -9,7 +9,14 @@ import pandas as pd
 from train.evaluate.changes import opponents
 from train.evaluate.environments import Column
 from train.evaluate.episodes import Evaluation
-from train.evaluate.scores import failures, over_cells, pair, per_robot, score
+from train.evaluate.scores import (
+    EpisodesByRobot,
+    failures,
+    match_episodes,
+    over_cells,
+    pair,
+    score,
+)
 from train.evaluate.statistics import Estimate, mean_of_part, middle_half, worst_share
 from train.evaluate.table import EpisodeTable, Scope
 
@@ -97,4 +104,5 @@ def share_better(mine: pd.DataFrame, base: pd.DataFrame, metric: str) -> Estimat
         rows.assign(**{metric: rows[metric].where(~rows["failed"], np.inf)})
         for rows in (mine, base)
     )
-    return over_cells(per_robot(pair(mine, base, metric), "won"))
+    won = pair(mine, match_episodes(mine, base), metric)["won"]
+    return over_cells(EpisodesByRobot(mine).figures(won))

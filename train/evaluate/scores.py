@@ -25,12 +25,13 @@ class EpisodesByRobot:
     """Episodes by cell, training seed and robot, grouped once for all metrics.
 
     Args:
-        rows: With `member`, `cell`, `robot` and metrics.
+        rows: With `member`, `cell` and `robot`.
     """
 
     def __init__(self, rows: pd.DataFrame) -> None:
-        self._groups: Any = rows.groupby(["cell", "member", "robot"])
-        index = self._groups.size().index
+        groups: Any = rows.groupby(["cell", "member", "robot"])
+        self._group_of = groups.ngroup().to_numpy()
+        index = groups.size().index
         cells, members = (index.get_level_values(i).to_numpy() for i in range(2))
         robots = index.codes[2]
         num_robots = len(index.levels[2])
@@ -47,19 +48,19 @@ class EpisodesByRobot:
             self._places.append((groups, row_of[groups], column_of))
 
     def figures(
-        self, metric: str, statistic: Literal["mean", "sum", "count"] = "mean"
+        self, values: "pd.Series[float]", statistic: Literal["mean", "sum", "count"] = "mean"
     ) -> list[Array]:
         """A statistic over the episodes of each robot, (seeds, robots) for every cell.
 
         Args:
-            metric: Its name.
+            values: A value for every row.
             statistic: nan without an episode; a mean also without a value.
         """
-        values = self._groups[metric].agg(statistic).to_numpy(dtype=np.float64)
+        figures = values.groupby(self._group_of).agg(statistic).to_numpy(dtype=np.float64)
         tables = []
         for groups, rows, columns in self._places:
             table = np.full((len(self._seeds), columns.max() + 1), np.nan)
-            table[rows, columns] = values[groups]
+            table[rows, columns] = figures[groups]
             tables.append(table)
         return tables
 
@@ -71,7 +72,7 @@ def per_robot(rows: pd.DataFrame, metric: str) -> list[Array]:
         rows: With `member`, `cell`, `robot` and the metric.
         metric: Its name.
     """
-    return EpisodesByRobot(rows).figures(metric)
+    return EpisodesByRobot(rows).figures(rows[metric])
 
 
 def episodes_as_robots(rows: pd.DataFrame) -> pd.DataFrame:
@@ -129,18 +130,15 @@ def means_of_cells(values: Sequence[Array], counts: Counts, mean: Mean = mean_of
     return np.array([mean(cell, count) for cell, count in cells])
 
 
-def pair(mine: pd.DataFrame, base: pd.DataFrame, metric: str) -> pd.DataFrame:
-    """Return the episodes of a policy with those of its base that have the same cell and seed.
+def match_episodes(mine: pd.DataFrame, base: pd.DataFrame) -> pd.DataFrame:
+    """Return the base's rows with the cells and seeds of a policy's rows, one for each of these.
 
     Args:
-        mine: Rows of a policy, with `member`, `cell`, `robot`, `seed` and the metric.
+        mine: Rows of a policy, with `member`, `cell` and `seed`.
         base: Rows of the base, one per cell and seed.
-        metric: Name of the metric.
 
     Returns:
-        A row for each of the policy's, with `member`, `cell` and `robot`, the metric as `mine` and
-        `base`, and `won`: 1 where the policy is better (lower), one half in a tie. These three are
-        nan where either has no value.
+        Metrics are nan where the base has no row.
 
     Raises:
         ValueError: A seed occurs twice, so that episodes cannot be paired.
@@ -150,13 +148,25 @@ def pair(mine: pd.DataFrame, base: pd.DataFrame, metric: str) -> pd.DataFrame:
             raise ValueError(
                 f"every episode needs a seed of its own to be paired, got {rows['seed'].tolist()}"
             )
-    theirs = base[["cell", "seed"]].assign(base=base[metric])
-    both = mine[["member", "cell", "robot", "seed"]].assign(mine=mine[metric])
-    both = both.merge(theirs, on=["cell", "seed"], how="left")
-    both = both.assign(won=beats(both["mine"], both["base"]))
-    values = both[["mine", "base", "won"]]
-    both[["mine", "base", "won"]] = values.where(values.notna().all(axis=1))
-    return both
+    matched = mine[["cell", "seed"]].merge(base, on=["cell", "seed"], how="left")
+    return matched.set_index(mine.index)
+
+
+def pair(mine: pd.DataFrame, base: pd.DataFrame, metric: str) -> pd.DataFrame:
+    """Return a metric of paired episodes.
+
+    Args:
+        mine: Rows of a policy.
+        base: Those of `match_episodes`.
+        metric: Name of the metric.
+
+    Returns:
+        A row for each of the policy's, with the metric as `mine` and `base`, and `won`: 1 where the
+        policy is better (lower), one half in a tie. All three are nan where either has no value.
+    """
+    both = pd.DataFrame({"mine": mine[metric], "base": base[metric]})
+    both["won"] = beats(both["mine"], both["base"])
+    return both.where(both.notna().all(axis=1))
 
 
 def failures(rows: pd.DataFrame) -> tuple[int, int]:
