@@ -14,7 +14,7 @@ from baselines.residual.residual_folder import load_residual
 from baselines.residual.residual_policy import ResidualPolicy
 from baselines.residual.settings import RESIDUAL
 from baselines.residual.true_robot import truth_of
-from elastic_env.core.errors import ConfigurationError, shorten, unknown_name
+from elastic_env.core.errors import ConfigurationError, choices_listed, quote, shorten, unknown_name
 from elastic_env.world.robot_model import RobotModel, WalkerModel, read_stiffness
 
 ITERATIVE = "iterative:"
@@ -116,7 +116,12 @@ def make(name: str, env: Any, /, **options: Any) -> Policy:
     named = policies_of(is_walker).get(name)
     if named is None:
         names = [*policies_of(is_walker), f"{RESIDUAL}PATH", "module:function"]
-        raise unknown_name(f"policy of the {env.unwrapped.task.name}", name, names)
+        robot = env.unwrapped.task.name
+        if name in policies_of(not is_walker):
+            owner = "robots on a fixed base" if is_walker else "the walker"
+            problem = f"{quote(name)} is a policy of {owner}, not of the {robot}"
+            raise ConfigurationError(f"{problem}; {choices_listed('', names)}")
+        raise unknown_name(f"policy of the {robot}", name, names)
     _require_effect(name, env, given, named.options)
     return named.build(env, _assumed_model(env, chosen), chosen)
 

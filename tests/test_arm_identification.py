@@ -865,6 +865,8 @@ REFUSED: Mapping[str, tuple[list[str], list[str]]] = {
     "within": (["--log", str(EXAMPLE), "--within", "0"], ["--within must be", "> 0"]),
     "plan": (["--log", str(EXAMPLE), "--plan", "201"], ["--plan must be", "<= 200"]),
     "testbed": (["--log", str(EXAMPLE), "--scenario", "soft"], ["--scenario", "testbed"]),
+    "no servo": (["--log", str(EXAMPLE), "--mass-kg", "1"], ["--mass-kg", f"{EXAMPLE} has the"]),
+    "no table": (["--log", str(FOLDER / "arm.xml"), "--mass-kg", "1"], ["arm.xml"]),
 }
 
 

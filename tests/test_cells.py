@@ -4,6 +4,7 @@ import io
 import json
 import os
 import sys
+import warnings
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -19,6 +20,7 @@ from train.cells.play import CellsFailedError, make_batches, run_conditions
 from train.cells.store import Store
 from train.evaluate.conditions import Condition, Member, PolicySpec
 from train.evaluate.episodes import Evaluation, evaluate
+from train.runs.console import warn_once
 from train.workers.executors import Executors
 
 SINE = {"kind": "sine", "duration_s": 0.5, "onset_s": 0.5, "amplitude": 0.1}
@@ -243,6 +245,33 @@ def test_a_robot_that_does_not_stand_ends_its_own_cell_alone() -> None:
     finished = [evaluation.condition for evaluation in failure.value.finished]
     assert finished == [conditions[0], conditions[2]] * 2
     assert str(failure.value).count("does not stand") == 1
+
+
+WARNING_POLICY = """
+import warnings
+import baselines
+
+def make(env):
+    warnings.warn("the policy is old", stacklevel=2)
+    return baselines.make("input", env)
+"""
+
+
+@pytest.mark.slow
+def test_a_warning_of_two_workers_is_shown_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Catches a line for each worker, and a warning that stays in the worker."""
+    monkeypatch.chdir(tmp_path)
+    Path("old.py").write_text(WARNING_POLICY)
+    policy = PolicySpec(name="old.py:make")
+    conditions = [Condition(policy=policy, reference=SINE, seed=seed) for seed in (0, 1)]
+    with warnings.catch_warnings(record=True) as shown:
+        warnings.simplefilter("always")
+        with warn_once():
+            run_conditions(conditions, Console(quiet=True), Executors(jobs=2))
+    assert [str(w.message) for w in shown].count("the policy is old") == 1
+    assert "the policy is old" not in capfd.readouterr().err
 
 
 @pytest.mark.parametrize("label", ["marked.inner:f", "marked.py:f", "broken.py:f", "broken:f"])

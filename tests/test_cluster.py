@@ -232,7 +232,8 @@ def test_other_versions_are_refused_with_both() -> None:
 @pytest.mark.parametrize("on", ["dask://nowhere", "ssh://host:1", "slurmy", ""])
 def test_a_place_that_does_not_exist_says_which_do(on: str) -> None:
     with pytest.raises(
-        ConfigurationError, match="on must be as follows: Executors: local, dask://HOST:PORT"
+        ConfigurationError,
+        match=f"unknown executors '{on}'; choose one of: local, dask://HOST:PORT",
     ):
         Executors(on=on)
 

@@ -657,7 +657,6 @@ def test_report_needs_nothing_from_outside_and_shows_every_part() -> None:
         "Residuals against their base",
         "Baselines against one another",
         "By phase, rms",
-        "First and last four steps, rms",
         "Curves over time",
         "Sweeps",
         "Learning curves",

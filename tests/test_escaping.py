@@ -26,7 +26,7 @@ from train.figures.chart import Chart, Curve, Panel
 from train.report.markdown import to_markdown
 from train.report.page import Page
 from train.report.tables import Table as ReportTable
-from train.runs.console import PlainConsole, traceback_text, visible_warnings
+from train.runs.console import PlainConsole, traceback_text, warn_once
 from train.runs.escaping import (
     chart_text,
     csv_cell,
@@ -148,9 +148,11 @@ def test_progress_and_warnings_obey_no_text() -> None:
     written = re.sub(r"\x1b\[[\d;]*[A-Za-ln-z]", "", console.file.getvalue())  # type: ignore[attr-defined]
     assert "\x9b" not in written
     assert "\u202e" not in written
-    with visible_warnings():
+    with warn_once():
         said = warnings.formatwarning(f"the joint {HOSTILE}", UserWarning, "file.py", 3)
-    assert "the joint a�" in said
+        foreign = warnings.formatwarning("1 / 0", RuntimeWarning, "file.py", 3)
+    assert said.startswith("warning: the joint a�")
+    assert foreign == "warning: RuntimeWarning: 1 / 0 (file.py:3)\n"
     assert not set(COMMANDS) & set(said)
     assert not set(COMMANDS) & set(traceback_text(ValueError(HOSTILE)))
 

@@ -196,6 +196,7 @@ def test_a_joint_without_weight_has_no_share() -> None:
         ([str(EXAMPLE)], "needs? .*stiffness|gives no joint its stiffness K"),
         ([str(EXAMPLE), "--stiffness", "nowhere.yaml"], "nowhere.yaml"),
         ([str(EXAMPLE), "--stiffness", "0"], "stiffness must be > 0"),
+        ([str(EXAMPLE), "--stiffness", "[1, 2]"], r"one number for all joints.* got \[1, 2\]"),
         ([str(EXAMPLE), "--stiffness", "900", "--end-effector", "tol"], "tool"),
         ([str(EXAMPLE), "--stiffness", "900", "--motion", "movs"], "moves"),
         ([str(JOINTS), "--stiffness", "900"], "keys model and joints"),

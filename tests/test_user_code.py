@@ -56,7 +56,7 @@ def test_what_is_wrong_with_a_file_is_said(tmp_path: Path) -> None:
     for name, said in (
         (f"{tmp_path / 'none.py'}:f", "there is no file"),
         (f"{bad}:f", "SystemExit: 5"),
-        (f"{good}:question", "unknown function or class of .* 'question'; choose one of: answer"),
+        (f"{good}:question", "unknown function or class in .*: 'question'; choose one of: answer"),
         (f"{empty}:f", "has no 'f', and no function or class of its own"),
     ):
         with pytest.raises(ConfigurationError, match=said):

@@ -1676,7 +1676,7 @@ def test_actions_of_wrong_shape_name_the_right_one(shape: tuple[int, ...]) -> No
         ),
         (
             {"stiffness": [1, 2, 3]},
-            r"one number or 12 of them \[N·m/rad\].*l_hip_yaw, .*, got an array of shape \(3,",
+            r"one number or a list of 12 \[N·m/rad\].*l_hip_yaw, .*; got \[1.0, 2.0, 3.0\]",
         ),
         (
             {"stiffness": -5.0},

@@ -262,7 +262,8 @@ def read_mapping(file: Path, empty: bool = False) -> dict[str, Any]:
     except ConfigurationError:
         raise
     except (yaml.YAMLError, UnicodeDecodeError) as error:
-        problem = f"{shorten(file)} is not valid YAML: {error}"
+        reason = str(error).replace('"<unicode string>"', shorten(file))
+        problem = f"{shorten(file)} is not valid YAML: {reason}"
     except IsADirectoryError:
         problem = f"{shorten(file)} is a folder, a YAML file is needed"
     except (FileNotFoundError, NotADirectoryError, ValueError):

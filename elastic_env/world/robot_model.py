@@ -211,8 +211,8 @@ def with_stiffness(
     values = np.asarray(stiffness, dtype=np.float64)
     if values.shape not in {(), (len(joints),)}:
         raise ConfigurationError(
-            f"stiffness must be one number or {len(joints)} of them [N·m/rad], one per"
-            f" joint ({', '.join(joints)}), got an array of shape {values.shape}"
+            f"stiffness must be one number or a list of {len(joints)} [N·m/rad], one for each"
+            f" joint: {', '.join(joints)}; got {quote(values.tolist())}"
         )
     each = np.broadcast_to(values, (len(joints),))
     return {

@@ -2,6 +2,7 @@
 
 import os
 import tempfile
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -17,7 +18,7 @@ from train.cells.store import Store
 from train.evaluate import rollout
 from train.evaluate.conditions import Condition
 from train.evaluate.episodes import MOST_WORLDS, Evaluation, evaluate, evaluate_together
-from train.runs.console import shown_warnings, warn_once
+from train.runs.console import warning_text
 from train.runs.failures import DEFECT, explain
 from train.runs.progress import Show, plain_progress, show_progress
 from train.workers.calls import Tally, Watch, run_calls
@@ -153,8 +154,8 @@ class _BatchRun:
         return self._outcomes
 
     def _play_in_workers(self) -> None:
-        watch = Watch(self._report, self._end, self._print_move)
-        arguments = [(cells, shown_warnings()) for cells in self._cells]
+        watch = Watch(self._report, self._end_in_worker, self._print_move)
+        arguments = [(cells,) for cells in self._cells]
         with tempfile.TemporaryDirectory() as temporary:
             folder = Path(temporary) if self.store is None else self.store.folder.parent
             with self.place.open_pool(len(arguments), folder) as pool:
@@ -166,6 +167,15 @@ class _BatchRun:
         if self._outcomes[numbers[0]] is None:  # a report may arrive after the end
             self._tally.running.update(numbers)
         self._show(0, sum(self._played), self._tally.summary("cells"))
+
+    def _end_in_worker(self, batch: int, outcome: Outcome) -> None:
+        """Repeat the warnings of a worker here, where each is shown once."""
+        if outcome.error is None:
+            outcomes, texts = outcome.value
+            for text in texts:
+                warnings.warn(text, stacklevel=2)
+            outcome = Outcome(outcomes)
+        self._end(batch, outcome)
 
     def _end(self, batch: int, outcome: Outcome) -> None:
         """Take the outcomes of the cells of a batch, or the error that ended the whole batch."""
@@ -255,11 +265,12 @@ def _step_counter(report: Callable[[int], None]) -> Callable[[int], None]:
 
 
 def _evaluate_in_worker(
-    conditions: Sequence[Condition], seen: frozenset[str], report: Callable[[int], None]
-) -> list[Outcome]:
-    """Evaluate conditions in a worker, without repeating warnings that were shown before."""
-    with warn_once(seen):
-        return _evaluate(conditions, report)
+    conditions: Sequence[Condition], report: Callable[[int], None]
+) -> tuple[list[Outcome], list[str]]:
+    """Evaluate conditions in a worker; return its warnings too, which it does not show."""
+    with warnings.catch_warnings(record=True) as caught:
+        outcomes = _evaluate(conditions, report)
+    return outcomes, [warning_text(w.message, w.category, w.filename, w.lineno) for w in caught]
 
 
 def _evaluate(

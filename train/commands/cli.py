@@ -9,13 +9,14 @@ import io
 import math
 import operator
 import os
+import re
 import signal
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Annotated, Any, get_args
+from typing import Annotated, Any, get_args, get_type_hints
 
 import tyro
 from rich.text import Text
@@ -23,13 +24,17 @@ from tyro.constructors import (
     ConstructorRegistry,
     PrimitiveConstructorSpec,
     PrimitiveTypeInfo,
+    StructConstructorSpec,
+    StructFieldSpec,
+    StructTypeInfo,
     UnsupportedTypeAnnotationError,
 )
 
 import elastic_env
+from elastic_env.core.config import Model
 from elastic_env.core.config_problems import ModelError
 from elastic_env.core.errors import shorten
-from train.runs.console import PlainConsole, traceback_text, visible_warnings
+from train.runs.console import PlainConsole, traceback_text, warn_once
 from train.runs.failures import DEFECT, SignalError, explain
 from train.runs.github_annotations import annotation, runs_in_workflow
 from train.runs.import_path import remove_from_path
@@ -118,6 +123,9 @@ def _parse(arguments: list[str]) -> Any:
 
     name = arguments[0]
     module = importlib.import_module(f"train.commands.{name}")
+    for kind in vars(module).values():
+        if isinstance(kind, type) and issubclass(kind, Model) and hasattr(kind, "run"):
+            kind.__doc__ = _set_examples_apart(kind.__doc__ or "")
     options = getattr(module, name.capitalize())
 
     def command(values: Any) -> Any:
@@ -148,6 +156,14 @@ def _parse(arguments: list[str]) -> Any:
         sys.stderr.write(messages.getvalue())
 
 
+def _set_examples_apart(text: str) -> str:
+    """Put each command that ends a paragraph on a line of its own, from which it can be copied."""
+    paragraphs = (" ".join(paragraph.split()) for paragraph in text.split("\n\n"))
+    parts = [re.sub(": (elastic .*)", r":\n    \1", paragraph) for paragraph in paragraphs]
+    # tyro hides a section called Example
+    return "\n\n".join(parts).replace("Example:\n", "For example:\n")
+
+
 _STYLE = (tyro.conf.OmitSubcommandPrefixes, tyro.conf.OmitArgPrefixes)
 _REGISTRY = ConstructorRegistry()
 
@@ -173,6 +189,26 @@ def _optional_rule(
     )
 
 
+@_REGISTRY.struct_rule
+def _model_rule(info: StructTypeInfo) -> StructConstructorSpec | None:
+    """Show no default that is None or empty; the description of such an option has its meaning."""
+    if not (isinstance(info.type, type) and issubclass(info.type, Model)):
+        return None
+    types = get_type_hints(info.type, include_extras=True)
+    hint = tyro.conf.arg(help_behavior_hint=_default_hint)
+    fields = []
+    for name, field in info.type.model_fields.items():
+        kind: Any = Annotated[types[name], hint]
+        own = tyro.MISSING if field.is_required() else field.get_default(call_default_factory=True)
+        default = getattr(info.default, name, own)
+        fields.append(StructFieldSpec(name, kind, default, field.description))
+    return StructConstructorSpec(info.type, tuple(fields))
+
+
+def _default_hint(default: str) -> str:
+    return "" if default in ("", "None") else f"(default: {default})"
+
+
 def _parse_overview(arguments: list[str]) -> Any:
     """Print the help of all commands without loading them, or refuse an unknown command."""
     members: Any = []
@@ -190,12 +226,12 @@ _OVERVIEW = (
 )
 
 
-def _help_of(name: str) -> str | None:
-    """Return the docstring of a command from its source."""
+def _help_of(name: str) -> str:
+    """Return the first paragraph of the docstring of a command from its source."""
     source = Path(__file__).with_name(f"{name}.py").read_text(encoding="utf-8")
     for node in ast.parse(source).body:
         if isinstance(node, ast.ClassDef) and node.name == name.capitalize():
-            return ast.get_docstring(node)
+            return (ast.get_docstring(node) or "").partition("\n\n")[0]
     raise AssertionError
 
 
@@ -204,7 +240,7 @@ def main(arguments: list[str] | None = None) -> None:
 
     def work() -> None:
         command = parse(sys.argv[1:] if arguments is None else arguments)
-        with announce_compilation(CONSOLE), visible_warnings():
+        with announce_compilation(CONSOLE), warn_once():
             command.run(CONSOLE)
 
     run_program(work)

@@ -33,8 +33,8 @@ class Evaluate(Model):
     foothold, phase_table, torque_sensor, hip_sensor,
     thormang, talos."""
     env: str = "testbed"
-    """Environment: testbed (one joint; with --port a real one), walker (a humanoid that walks),
-    robot, ROBOT.yaml (a file of any robot, see docs/robots.md), or "FILE.py:ROBOT", a
+    """Environment: testbed (one joint), hardware (a real one, at --port), walker (a humanoid that
+    walks), robot, ROBOT.yaml (a file of any robot, see docs/robots.md), or "FILE.py:ROBOT", a
     JointRobot."""
     scenario: str | None = None
     """Scenario, such as nominal (default), ideal, soft, stiff, spread, payload, backlash,

@@ -124,7 +124,8 @@ class Run(Model):
 
     Example: elastic hardware run --port /dev/ttyUSB0 --imu-port /dev/ttyACM0 --policy input
         --reference sine
-    A short one: --reference '{kind: sine, amplitude: 0.2, duration_s: 5}'
+
+    A short motion is --reference '{kind: sine, amplitude: 0.2, duration_s: 5}'.
     """
 
     policy: str = "uncompensated"

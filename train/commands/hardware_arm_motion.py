@@ -53,7 +53,8 @@ def move_arm(
     with contextlib.ExitStack() as stack:
         pairs = zip(setup.servos.ids, setup.joints, strict=True)
         servos = ", ".join(f"{i} {name}" for i, name in pairs)
-        console.print(f"{len(setup.joints)} servos at {setup.settings.port}: {servos}")
+        place = "emulated servos" if options.dry_run else f"servos at {setup.settings.port}"
+        console.print(f"{len(setup.joints)} {place}: {servos}")
         simulation = None
         if options.dry_run:
             config = dry_run.emulator_config(setup)

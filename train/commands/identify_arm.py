@@ -19,7 +19,7 @@ from baselines.identification.geometry_result import GeometryIdentification
 from baselines.identification.holdout import HoldoutProblem
 from baselines.identification.pose_log import PoseLog, write_poses
 from baselines.identification.pose_plan import PosePlan, candidate_poses, plan_further, plan_poses
-from baselines.identification.servo_file import is_servo_log
+from baselines.identification.servo_file import is_servo_log, read_content
 from baselines.identification.servo_result import ServoIdentification
 from baselines.identification.static_arm import StaticArm
 from elastic_env.core.errors import ConfigurationError, quote
@@ -112,10 +112,14 @@ def _require_poses(options: ArmOptions) -> None:
                 " goal and position, one of poses those of docs/identification.md"
             )
     if options.servo != ServoOptions():
-        raise ConfigurationError(
-            "--mass-kg, --lever-m, --gain, --angles and --unfitted are for logs in time; name one"
-            " with columns time, goal and position by --log"
-        )
+        problem = "--mass-kg, --lever-m, --gain, --angles and --unfitted are for logs in time"
+        try:
+            for log in logs:
+                read_content(log, None)
+        except ConfigurationError as error:
+            raise ConfigurationError(f"{problem}; {error}") from None
+        cure = "name one with columns time, goal and position by --log"
+        raise ConfigurationError(f"{problem}; {cure}")
     if options.robot is None:
         problem = "--robot is missing; name the arm's model, a file of MJCF (.xml) or URDF (.urdf)"
         raise ConfigurationError(problem)

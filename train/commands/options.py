@@ -12,7 +12,7 @@ from tyro.constructors import PrimitiveConstructorSpec
 
 from elastic_env.core.config import Locator, Model, load_yaml
 from elastic_env.core.config_problems import ModelError, ParameterPath
-from elastic_env.core.errors import ConfigurationError
+from elastic_env.core.errors import ConfigurationError, quote
 from elastic_env.core.yaml_text import parse_yaml
 from elastic_env.hardware.settings import PATIENT_LIMITS, HardwareSettings
 from elastic_env.robots.testbed.model import Pendulum
@@ -22,12 +22,20 @@ from train.evaluate.environments import environment
 DEFAULT_SCENARIO = "nominal"
 """Scenario of a simulation, if the user names none."""
 
+
+def _write_yaml(value: Any) -> str:
+    """Return a default as a user types it."""
+    if not isinstance(value, dict | list):
+        return str(value)
+    return yaml.safe_dump(value, default_flow_style=True, sort_keys=False).strip()
+
+
 _TEXT = PrimitiveConstructorSpec(
     nargs=1,
     metavar="STR",
     instance_from_str=lambda words: words[0],
     is_instance=lambda _: True,
-    str_from_instance=lambda value: [str(value)],
+    str_from_instance=lambda value: [_write_yaml(value)],
 )
 
 
@@ -54,13 +62,21 @@ def _read_stiffness(text: Any) -> Any:
     return text
 
 
+def _read_one_stiffness(text: Any) -> Any:
+    value = _read_stiffness(text)
+    if isinstance(value, list):
+        needed = "one number for all joints [N·m/rad], or a YAML file with one for each"
+        raise ValueError(f"give {needed}, got {quote(value)}")
+    return value
+
+
 Motion = Annotated[GivenReference, BeforeValidator(_read_reference), _TEXT]
 """A reference: a name, a number, durations or a mapping, or one of these as YAML text."""
 MotionOrDefault = Annotated[Any, BeforeValidator(_read_reference), _TEXT]
 """A reference that its cell checks; or None, for the environment's default."""
 Stiffness = Annotated[Any, BeforeValidator(_read_stiffness), _TEXT]
 """A stiffness: a number, a list of numbers, one of these as text, or the path of a file."""
-StiffnessOrFile = Annotated[Locator | float | None, BeforeValidator(_read_stiffness), _TEXT]
+StiffnessOrFile = Annotated[Locator | float | None, BeforeValidator(_read_one_stiffness), _TEXT]
 """One stiffness, as a number or as text, or the path of a file."""
 
 

@@ -101,13 +101,14 @@ class Speed(Model):
     def run(self, console: Console) -> None:
         """Measure, print the figures, and write them."""
         work = measure_real_time if self.real_time else measure_throughput
-        console.print(f"wrote {work(self, console)}")
+        for path in work(self, console):
+            console.print(f"wrote {path}")
 
 
 _TIMES = {"latency": "from due to command", "policy": "in the policy"}
 
 
-def measure_real_time(config: Speed, console: Console) -> Path:
+def measure_real_time(config: Speed, console: Console) -> list[Path]:
     """Time a policy at the control rate, print its latencies, and write them as JSON."""
     recorded = config.model_dump(mode="json", include={"env", "policy", "seconds"})
     with run_folder("speed", recorded, 0, config.output) as folder:
@@ -126,10 +127,10 @@ def measure_real_time(config: Speed, console: Console) -> Path:
     console.print(f"late: {figures['late']} of {figures['cycles']} cycles, {share:.3f} %")
     if not figures["is_real_time"]:
         console.print("without real-time scheduling, to which this user has no right")
-    return path
+    return [path]
 
 
-def measure_throughput(config: Speed, console: Console) -> Path:
+def measure_throughput(config: Speed, console: Console) -> list[Path]:
     """Time all contenders, print their ratios, and write them as JSON and CSV."""
     if config.others or config.ppo:
         # so that a missing package fails before the work
@@ -142,10 +143,11 @@ def measure_throughput(config: Speed, console: Console) -> Path:
         results = measure(config, plain_progress(console))
         path = folder / "speed.json"
         path.write_text(json.dumps(results, indent=2) + "\n")
-        write_records(results, folder / "speed.csv")
+        files = [path, write_records(results, folder / "speed.csv")]
         if config.profile:
             text = profile(config)
-            (folder / "profile.txt").write_text(text)
+            files.append(folder / "profile.txt")
+            files[-1].write_text(text)
             console.print(text)
     title = f"{config.env}: control steps per second, medians of one interleaved run"
     rows = []
@@ -156,7 +158,7 @@ def measure_throughput(config: Speed, console: Console) -> Path:
     table = make_table(title, ["", "worlds", "steps/s", "ratio", "to"], rows)
     table.columns[-1].justify = "left"
     console.print(table)
-    return path
+    return files
 
 
 def measure(config: Speed, progress: Callable[[float], None]) -> list[dict[str, Any]]:

@@ -18,11 +18,15 @@ from train.workers.executors import Executors
 class Train(Model):
     """Train a residual on top of a base policy, for every training seed of a configuration.
 
-    Example: elastic train train_walker_3s, and to continue it: elastic train --resume runs/NAME.
-    The seeds of several configurations share the workers: elastic train a.yaml b.yaml --jobs 4.
     Each configuration has its own run. For every seed the run has checkpoint/ to continue from,
     best/ and last/ as policies for elastic evaluate and compare (residual:PATH), progress.csv, and
-    files for TensorBoard.
+    files for TensorBoard. The seeds of several configurations share the workers.
+
+    Example: elastic train train_walker_3s
+
+    To continue it: elastic train --resume runs/NAME
+
+    Several configurations: elastic train a.yaml b.yaml --jobs 4
     """
 
     config: Annotated[tuple[Path, ...], tyro.conf.Positional] = ()

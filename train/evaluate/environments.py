@@ -1,7 +1,7 @@
 """The environments as the commands know them: their arguments, figures and tables."""
 
 import tomllib
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from itertools import chain
@@ -14,6 +14,7 @@ from elastic_env import IDS
 from elastic_env.core.errors import ConfigurationError, quote, unknown_name
 from elastic_env.motion.gait import Gait
 from elastic_env.robots.joint_robot import JointRobot
+from elastic_env.robots.thormang.tables import BLOCK_STEPS
 from elastic_env.world.scenario import make_scenario
 from train.evaluate.robot_file import ENDINGS, read_robot_file
 from train.runs.user_code import named_object
@@ -173,6 +174,10 @@ class Environment:
         columns = chain(self.columns, self.judged, self.also, *self.splits.values())
         return list(dict.fromkeys(column.metric for column in columns))
 
+    def splits_of(self, cells: Iterable[Mapping[str, Any]]) -> dict[str, tuple[Column, ...]]:  # noqa: ARG002
+        """Further tables of the summary for cells with these arguments."""
+        return self.splits
+
     def arguments(self, reference: Reference) -> dict[str, Any]:
         """Arguments of `gymnasium.make` for a reference."""
         return {**self.further_arguments, self.motion: reference}
@@ -217,6 +222,13 @@ _PAPER_NUM_STEPS = {"24 s": 2}
 class _Walker(Environment):
     """The walker, whose reference is a step period, or a mapping with one."""
 
+    def splits_of(self, cells: Iterable[Mapping[str, Any]]) -> dict[str, tuple[Column, ...]]:
+        if any(_num_scored_steps(arguments) > BLOCK_STEPS for arguments in cells):
+            return self.splits
+        # the first and the last steps are the whole walk
+        splits = self.splits.items()
+        return {title: cols for title, cols in splits if "first_steps" not in cols[0].metric}
+
     def arguments(self, reference: Reference) -> dict[str, Any]:
         further = reference if isinstance(reference, dict) else {}
         return {**further, self.motion: _step_period(reference)}
@@ -237,6 +249,13 @@ class _Walker(Environment):
 
     def abscissa(self, reference: Reference) -> dict[str, float]:
         return {"step_period_s": float(f"{sum(map(float, _durations(reference))):.6g}")}
+
+
+def _num_scored_steps(arguments: Mapping[str, Any]) -> int:
+    """Number of scored steps of a walk with these arguments."""
+    gait = arguments.get("gait") or {}
+    steps = arguments.get("num_steps") or Gait.model_fields["num_steps"].default
+    return steps - gait.get("settling_steps", 0)
 
 
 def _step_period(reference: Reference) -> Any:

@@ -194,8 +194,9 @@ def _require_options(spec: PolicySpec, function: Callable[..., Any], options: An
 
 
 def _policy_error(spec: PolicySpec, problem: str) -> ConfigurationError:
+    end = "" if problem.endswith((".", "?")) else "."
     return ConfigurationError(
-        f"policy {spec.name!r}: {problem}; give a baseline, such as input, or"
+        f"policy {spec.name!r}: {problem}{end} Give a baseline, such as input, or"
         ' "FILE.py:function" or "module:function", a function or class that takes the environment'
         " and returns an object with predict()"
     )

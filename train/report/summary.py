@@ -138,7 +138,8 @@ def _parts(evaluations: Sequence[Evaluation]) -> list[str]:
         " ".join(filter(None, [*column_notes(environment.columns), environment.note])),
         to_markdown(summary_table(evaluations, environment.columns, worst=True)),
     ]
-    for title, columns in environment.splits.items():
+    splits = environment.splits_of(e.condition.arguments for e in evaluations)
+    for title, columns in splits.items():
         table = summary_table(evaluations, columns, worst=True)
         parts += [f"{title}:", to_markdown(table)]
     if notes := failure_notes(evaluations):

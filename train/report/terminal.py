@@ -9,6 +9,7 @@ from rich.console import Console
 from rich.table import Table as RichTable
 from rich.text import Text
 
+from elastic_env.core.errors import quote
 from train.report.tables import Cell, Table, column_notes, parts_of
 
 _ANY_WIDTH = 10_000
@@ -36,7 +37,8 @@ def print_table(table: Table, console: Console, file: str) -> None:
         table = table.without(place)
     console.print(fitting)
     if missing:
-        message = f"no room for {'; '.join(missing)}: widen the terminal, or see {file}"
+        columns = ", ".join(map(quote, missing))
+        message = f"no room for {columns}: widen the terminal, or see {file}"
         console.print(message, style="dim", markup=False)
 
 

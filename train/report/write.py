@@ -89,7 +89,8 @@ def _page(results: Results) -> Page:
     if results.robots:
         page.section("Drawn robots", TEXTS["robots"])
         _add_table(page, robots_table(results.robots), "Table of drawn robots")
-    for title, columns in results.environment.splits.items():
+    splits = results.environment.splits_of(e.condition.arguments for e in results.evaluations)
+    for title, columns in splits.items():
         page.section(title, TEXTS["scores"])
         _add_table(page, scores_table(results.table, columns))
     if results.has_conditions:

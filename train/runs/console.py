@@ -4,7 +4,6 @@ import traceback
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from contextvars import ContextVar
 from pathlib import Path
 from typing import Any
 
@@ -90,46 +89,29 @@ def traceback_text(error: BaseException) -> str:
     return visible("".join(traceback.format_exception(error)))
 
 
-@contextmanager
-def visible_warnings() -> Iterator[None]:
-    """Show warnings within the context without terminal commands."""
-    before = warnings.formatwarning
-    warnings.formatwarning = lambda *arguments: visible(before(*arguments))
-    try:
-        yield
-    finally:
-        warnings.formatwarning = before
-
-
-_SHOWN: ContextVar[set[str] | None] = ContextVar("shown", default=None)
-
-
-def shown_warnings() -> frozenset[str]:
-    """Return the warnings that `warn_once` has shown, which other processes must not repeat."""
-    return frozenset(_SHOWN.get() or ())
+def warning_text(
+    message: Warning | str, category: type[Warning], file: str, line: int, *_: Any
+) -> str:
+    """Return a warning as a sentence; one of a library with its kind and place."""
+    if category is UserWarning:
+        return str(message)
+    return f"{category.__name__}: {message} ({file}:{line})"
 
 
 @contextmanager
-def warn_once(shown: Iterable[str] = ()) -> Iterator[None]:
-    """Show each warning within the context once.
-
-    Args:
-        shown: Texts that were shown before, such as in the process that started this one.
-    """
-    outer = _SHOWN.get()
-    known = set[str]() if outer is None else outer
-    known.update(shown)
-    token = _SHOWN.set(known)
-    before = warnings.showwarning
+def warn_once() -> Iterator[None]:
+    """Show each warning within the context once, on a line without terminal commands."""
+    known = set[str]()
+    before = (warnings.showwarning, warnings.formatwarning)
 
     def show(message: Warning | str, *where: Any) -> None:
         if str(message) not in known:
             known.add(str(message))
-            before(message, *where)
+            before[0](message, *where)
 
     warnings.showwarning = show
+    warnings.formatwarning = lambda *warning: visible(f"warning: {warning_text(*warning)}\n")
     try:
         yield
     finally:
-        warnings.showwarning = before
-        _SHOWN.reset(token)
+        warnings.showwarning, warnings.formatwarning = before

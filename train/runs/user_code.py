@@ -161,7 +161,7 @@ def named_object(name: str) -> Any:
         if not names:
             problem = f"{shorten(source)} has no {attribute!r}"
             raise ConfigurationError(f"{problem}, and no function or class of its own")
-        raise unknown_name(f"function or class of {shorten(source)}", attribute, names)
+        raise unknown_name(f"function or class in {shorten(source)}:", attribute, names)
     return getattr(module, attribute)
 
 

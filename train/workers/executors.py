@@ -1,12 +1,15 @@
 """Executors of calls, the values of `--on`: this machine, a dask cluster, jobs of Slurm."""
 
 import os
+import re
 from contextlib import AbstractContextManager
 from pathlib import Path
+from typing import Annotated
 
-from pydantic import Field
+from pydantic import AfterValidator
 
 from elastic_env.core.config import Model, load_yaml, quantity
+from elastic_env.core.errors import unknown_name
 from train.workers.dask_cluster import dask_pool
 from train.workers.local import local_pool
 from train.workers.pool import Pool
@@ -14,7 +17,14 @@ from train.workers.slurm import SlurmConfig, slurm_pool
 
 _LOCAL = "local"
 _DASK = "dask://"
-_NAMES = rf"(?s)^({_LOCAL}|{_DASK}.+:\d+|slurm(:.*)?)$"
+_NAMES = re.compile(rf"(?s){_LOCAL}|{_DASK}.+:\d+|slurm(:.*)?")
+_CHOICES = (_LOCAL, f"{_DASK}HOST:PORT", "slurm", "slurm:FILE.yaml")
+
+
+def _require_executors(name: str) -> str:
+    if not _NAMES.fullmatch(name):
+        raise unknown_name("executors", name, _CHOICES)
+    return name
 
 
 class Executors(Model):
@@ -24,7 +34,7 @@ class Executors(Model):
     """Cells, or training seeds, at a time on this machine, 0 for one per core; several share the
     cores, and all of them end sooner than one by one. On hardware cells come one after the other; a
     cluster decides itself."""
-    on: str = Field(default=_LOCAL, pattern=_NAMES)
+    on: Annotated[str, AfterValidator(_require_executors)] = _LOCAL
     """Executors: local, dask://HOST:PORT of a scheduler, slurm, or slurm:FILE.yaml with what a job
     asks for; see docs/cluster.md."""
 
