@@ -2,6 +2,7 @@
 time."""
 
 import contextlib
+import functools
 import io
 import json
 import os
@@ -42,7 +43,7 @@ from elastic_env.hardware.live import arm as live
 from elastic_env.hardware.live.arm_state import ArmLog, ArmState, live_table
 from elastic_env.hardware.live.consent import require_consent
 from elastic_env.hardware.live.follower import Follower
-from elastic_env.hardware.live.joint_check import check_joint, require_signs, wrong_sign
+from elastic_env.hardware.live.joint_check import check_joint, wrong_sign
 from elastic_env.hardware.live.target_streams import Socket, Stream
 from elastic_env.hardware.live.targets import Poses, Targets, read_targets
 from elastic_env.hardware.safety.supervised_bus import Cycle, SupervisedBus
@@ -167,7 +168,7 @@ def misjudged(folder: Path) -> Path:
 def test_compensation_places_the_tip_from_both_sides(tmp_path: Path) -> None:
     """Catches a sign, a zero or a delay between target and wire: the true links of an emulated
     SO-101 (P gain 16), seen through the bus; and a result that needs the exact parameters."""
-    poses = drawn(3)
+    poses = drawn(1)
     found = {}
     for name, commands in (
         ("plain", Plain()),
@@ -214,6 +215,23 @@ def test_an_uncompensated_arm_reaches_a_part_of_a_small_lift() -> None:
     assert 0.4 < share < 0.8
 
 
+def test_a_joint_that_no_target_moves_is_compensated_too() -> None:
+    """Catches dry friction without a side: the load of a joint at rest, and an offset that grows
+    after the arm has moved."""
+    pose = HOME + [0.0, 0.1, 0.0, 0.0, 0.0, 0.0]
+    errors = []
+    for ramp_s, way_rad in ((0.0, 0.0), (0.5, 0.08)):
+        virtual = virtual_arm(emulated())
+        arm = begun(virtual, compensator())
+        for _ in arm.approach_start(ramp_s, way_rad):
+            pass
+        for _ in arm.play(Poses(pose[None], 1.0)):
+            pass
+        errors.append(np.abs(virtual.links - pose)[1:3].max())
+    assert errors[1] < 0.006
+    assert errors[0] > 2.0 * errors[1]
+
+
 def test_directions_and_zeros_of_the_mounting_are_those_of_the_arm() -> None:
     """Catches a sign that is used on the way out but not on the way in."""
     direction = (1, -1, 1, -1, -1, 1)
@@ -230,26 +248,6 @@ def test_directions_and_zeros_of_the_mounting_are_those_of_the_arm() -> None:
     pose = drawn(1)
     q = rests(arm, virtual, pose)
     assert placed(q, pose)[0] < 0.002
-
-
-def test_a_turned_joint_is_found_by_its_load() -> None:
-    """Catches a wrong direction that drives the arm away from its targets: the check says which
-    joint, and what to write."""
-    turned = NAMES.index("elbow_flex")
-    direction = [1] * 6
-    direction[turned] = -1
-    virtual = virtual_arm(emulated(direction=tuple(direction)))
-    arm = begun(virtual, compensator())
-    checks = [check_joint(arm, joint, 0.08) for joint in range(6)]
-    setup = ArmSetup(OPTIONS, JOINTS)
-    with pytest.raises(HardwareError, match=r"'elbow_flex' holds .*write direction: -1 for it"):
-        require_signs(arm.servos, checks, setup.links.gravity_torque, setup.compensator.settings)
-    right = virtual_arm(emulated())
-    arm = begun(right, compensator())
-    checks = [check_joint(arm, joint, 0.08) for joint in range(6)]
-    require_signs(arm.servos, checks, setup.links.gravity_torque, setup.compensator.settings)
-    assert checks[1].gain == pytest.approx(11.95, rel=0.1)
-    assert all(0.5 < own.follow_ratio < 1.0 for own in checks)
 
 
 @given(st.integers(0, 1000), st.sampled_from([None, 1, 2, 3]))
@@ -278,36 +276,42 @@ servo: {position_gain: 11.95, velocity_gain: 0.53}"""
 """What elastic identify finds of the emulated servos: dry friction is lost in its interval."""
 
 
-@pytest.mark.parametrize("own", ["", IDENTIFIED], ids=["typical", "identified"])
-def test_a_wrong_zero_shows_in_the_loads(own: str, tmp_path: Path) -> None:
-    """Catches a zero that is off by a quarter turn without a word, and a right one with one, also
-    where the file of joints says that there is no friction."""
-    said = []
-    joints_file = tmp_path / "joints.yaml"
-    joints_file.write_text("'*':\n" + textwrap.indent(own, "  ") if own else JOINTS.read_text())
-    for zero in (0.0, 1.4):
-        zeros = (0.0, zero, 0.0, 0.0, 0.0, 0.0)
-        virtual = virtual_arm(emulated(zero_rad=zeros))
-        joints = dict(SETTINGS.joints)
-        setup = ArmSetup(OPTIONS, joints_file)
-        arm = begun(virtual, compensator(), SETTINGS.replace(joints=joints))
-        text = io.StringIO()
-        check_joints(arm, setup, PlainConsole(file=text, width=120))
-        said.append(text.getvalue())
-    assert "zero_rad" not in said[0]
-    assert "light: its load does not show the sign" in said[0]
-    assert "look at zero_rad" in said[1]
+def joints_table(virtual: VirtualBus, joints_file: Path = JOINTS) -> str:
+    """What is said of an arm whose joints are moved a little."""
+    arm = begun(virtual, compensator(), SETTINGS.replace(rate_hz=50.0))
+    text = io.StringIO()
+    check_joints(arm, ArmSetup(OPTIONS, joints_file), PlainConsole(file=text, width=120))
+    return text.getvalue()
+
+
+def test_a_sound_arm_follows_and_its_gain_is_measured() -> None:
+    """Catches a right zero or direction that is called wrong, and a gain that is not the arm's."""
+    said = joints_table(virtual_arm(emulated()))
+    assert "zero_rad" not in said
+    assert "light: its load does not show the sign" in said
+    followed = [re.search(rf"{name}\W+(\d+) %", said) for name in NAMES]
+    assert all(share is not None and 50 < int(share[1]) <= 100 for share in followed)
+    (row,) = re.findall(r"shoulder_lift.*", said)
+    _, load, by_model, gain, _ = map(float, re.findall(r"[-+]?\d+\.?\d*", row))
+    assert load == pytest.approx(by_model, abs=0.1)
+    assert gain == pytest.approx(11.95, rel=0.1)
+
+
+def test_a_wrong_zero_shows_in_the_loads() -> None:
+    """Catches a zero that is off by a quarter turn without a word."""
+    said = joints_table(virtual_arm(emulated(zero_rad=(0.0, 1.4, 0.0, 0.0, 0.0, 0.0))))
+    assert "look at zero_rad" in said
 
 
 @pytest.mark.filterwarnings("ignore:.*taken for rigid")
 def test_a_joint_that_the_file_leaves_out_is_checked_as_a_rigid_one(tmp_path: Path) -> None:
-    """Catches a KeyError in the midst of the check, where the compensator has only warned."""
+    """Catches a KeyError in the midst of the check, where the compensator has only warned; and a
+    right zero that is called wrong, where the file of joints says that there is no friction."""
     joints_file = tmp_path / "joints.yaml"
-    joints_file.write_text(JOINTS.read_text().replace('"*"', '"[!g]*"'))
-    text = io.StringIO()
-    arm = begun(virtual_arm(emulated()), compensator())
-    check_joints(arm, ArmSetup(OPTIONS, joints_file), PlainConsole(file=text, width=120))
-    assert re.search(r"gripper .* -\W", text.getvalue())
+    joints_file.write_text("'[!g]*':\n" + textwrap.indent(IDENTIFIED, "  "))
+    said = joints_table(virtual_arm(emulated()), joints_file)
+    assert re.search(r"gripper .* -\W", said)
+    assert "zero_rad" not in said
 
 
 def test_a_held_joint_is_where_the_models_keyframe_has_it(tmp_path: Path) -> None:
@@ -334,7 +338,7 @@ def test_an_arm_that_fell_on_its_stops_passes_its_check() -> None:
     begun(bus, Plain()).close()
     bus.sleep(3.0)
     assert bus.links[1] > HIGHEST[1]
-    arm = begun(bus, compensator())
+    arm = begun(bus, compensator(), SETTINGS.replace(rate_hz=50.0))
     assert arm.start[1] == pytest.approx(HIGHEST[1])
     text = io.StringIO()
     check_joints(arm, ArmSetup(OPTIONS, JOINTS), PlainConsole(file=text, width=120))
@@ -399,7 +403,7 @@ def test_goals_stay_within_the_ranges_of_each_joint() -> None:
 
 
 @given(
-    st.lists(st.floats(-3.0, 3.0), min_size=1, max_size=5),
+    st.lists(st.floats(-1.0, 1.0), min_size=1, max_size=4),
     st.sampled_from([0.005, 0.01, 0.02]),
 )
 def test_desired_angles_reach_every_target_without_overshoot(
@@ -409,7 +413,7 @@ def test_desired_angles_reach_every_target_without_overshoot(
     follower = Follower(np.zeros(1), speed=0.5, acceleration=2.0)
     for end in ends:
         begin = follower.q[0]
-        for _ in range(round(20.0 / period_s)):
+        for _ in range(round(8.0 / period_s)):
             before, rate = follower.q[0], follower.q_dot[0]
             follower.step(np.array([end]), period_s)
             assert abs(follower.q[0] - before) <= 0.5 * period_s + 1e-12
@@ -660,7 +664,7 @@ def test_settings_with_which_nothing_may_move_are_named(
 def test_the_log_is_one_that_identify_reads(tmp_path: Path) -> None:
     """Catches a column or a sign that the identification of servos would not take: the load that
     turns the joint forward, against the torque that holds it."""
-    states, files = logged(tmp_path, compensator(), drawn(2))
+    states, files = logged(tmp_path, compensator(), drawn(1))
     assert [one.name for one in files] == [f"servo_{name}.csv" for name in NAMES[1:4]]
     read = read_servo_log(files[1], joint="elbow_flex")
     assert len(read) == len(states)
@@ -777,6 +781,7 @@ RELEASE_S = 0.3
 RATE_HZ = 50.0
 
 
+@functools.cache
 def two_arms() -> EmulatorConfig:
     """Two SO-101 side by side, on one bus of twelve servos."""
     spec = mujoco.MjSpec.from_file(ROBOT)
@@ -921,7 +926,7 @@ def test_every_fault_of_twelve_servos_ends_or_holds_the_motion(
     held = arm.counts.held
     bus.emulator.set_faults(case.faults)
     if case.goes_on:
-        play(arm, targets, 100)
+        play(arm, targets, 40)
         assert bus.emulator.state["torque_on"] == [True] * 12
         delay_s = max(case.faults.get(name, 0.0) for name in DELAYS)
         assert (arm.counts.held > held) == (not 0.0 < delay_s <= FeetechBus.patience_s)
@@ -961,10 +966,13 @@ def play(arm: live.Arm, targets: Any, cycles: int) -> None:
 def test_a_dry_run_by_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Catches a step between the command line and the emulated arm that does not fit, and an
     estimate that is told as the truth."""
+    poses = tmp_path / "poses.csv"
+    # without a check the elbow, which stays, rests where its friction leaves it
+    poses.write_text(f"{POSES.splitlines()[0]}\n0,0.1,0,0,0,0\n")
     main(
         [
             *("hardware", "compensate", "--robot", ROBOT, "--joints", str(JOINTS)),
-            *("--mounting", str(MOUNTING), "--targets", str(FOLDER / "so101_poses.csv")),
+            *("--mounting", str(MOUNTING), "--targets", str(poses)),
             *("--dry-run", "--no-check", "--output", str(tmp_path / "run")),
         ]
     )
@@ -973,9 +981,9 @@ def test_a_dry_run_by_the_command_line(tmp_path: Path, capsys: pytest.CaptureFix
     assert "estimated link from its target" in said
     estimated, true, plain = map(float, re.findall(r"([\d.]+) mm", said))
     assert estimated != true
-    assert true < 0.1 * plain
+    assert true < 0.5 * plain
     table = np.genfromtxt(tmp_path / "run" / "log.csv", delimiter=",", names=True)
-    assert len(table) > 300
+    assert len(table) > 150
     assert (tmp_path / "run" / "servo_elbow_flex.csv").is_file()
 
 
@@ -997,11 +1005,11 @@ def test_a_dry_run_of_joints_that_are_hard_to_simulate(
     joints = tmp_path / "joints.yaml"
     joints.write_text(f'"*": {stiffness}\n')
     poses = tmp_path / "poses.csv"
-    poses.write_text("\n".join((FOLDER / "so101_poses.csv").read_text().splitlines()[:2]) + "\n")
+    poses.write_text("\n".join(POSES.splitlines()[:2]) + "\n")
     arguments = [
         *("hardware", "compensate", "--robot", ROBOT, "--joints", str(joints)),
         *("--mounting", str(MOUNTING), "--targets", str(poses)),
-        *("--dry-run", "--output", str(tmp_path / "run")),
+        *("--dry-run", "--no-check", "--output", str(tmp_path / "run")),
     ]
     ended = 0
     try:
@@ -1068,7 +1076,10 @@ TURNED = (1, 1, -1, 1, 1, 1)
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"arm": emulated(direction=TURNED)}, "write direction: -1 for it in the mounting"),
+        (
+            {"arm": emulated(direction=TURNED)},
+            r"'elbow_flex' holds .*write direction: -1 for it in the mounting",
+        ),
         ({"faults": Faults(same_id=True)}, "damaged packets, as two servos with one id do"),
         ({"model_number": 2825}, "is a STS3250: correct its id or its model"),
     ],
@@ -1080,18 +1091,21 @@ def test_an_arm_that_is_not_as_the_files_say_is_one_sentence_at_the_command_line
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """Catches a traceback, a wrong cause, and an exit code of success."""
+    """Catches a traceback, a wrong cause, an exit code of success, and a wrong direction that
+    drives the arm away from its targets."""
     config = EmulatorConfig(model_number=777, ids=tuple(range(1, 7)), arm=emulated())
     monkeypatch.setattr(
         hardware_arm_dry_run, "emulator_config", lambda _: config.replace(**changes)
     )
-    files = ["--robot", ROBOT, "--joints", str(JOINTS), "--mounting", str(MOUNTING)]
+    mounting = tmp_path / "mounting.yaml"
+    mounting.write_text(f"{SOUND}\nrate_hz: 50\n")
+    files = ["--robot", ROBOT, "--joints", str(JOINTS), "--mounting", str(mounting)]
     files += ["--targets", str(FOLDER / "so101_poses.csv"), "--output", str(tmp_path / "run")]
     with pytest.raises(SystemExit) as ended:
         main(["hardware", "compensate", *files, "--dry-run"])
     assert ended.value.code == 3
     (said,) = capsys.readouterr().err.strip().splitlines()
-    assert words in said
+    assert re.search(words, said)
 
 
 def test_a_virtual_bus_may_keep_the_pace_of_somebody_who_sends_targets() -> None:
@@ -1111,8 +1125,8 @@ def test_an_arm_runs_at_both_ends_of_its_range_of_rates(rate_hz: float) -> None:
     the last bit of a clock."""
     bus = virtual_arm(emulated())
     arm = begun(bus, Plain(), SETTINGS.replace(rate_hz=rate_hz))
-    play(arm, Poses(drawn(5), 1.0), 300)
-    assert arm.counts.cycles == 300
+    play(arm, Poses(drawn(5), 1.0), 120)
+    assert arm.counts.cycles == 120
     assert arm.counts.late == 0
 
 

@@ -275,8 +275,6 @@ class StillBus:
     def close(self) -> None:
         pass
 
-    is_confirmed_off = True
-
     def enable(self, limits: Any) -> Any:
         return np.zeros(1)
 

@@ -18,7 +18,8 @@ from elastic_env.joint.model_joints import held_positions
 from elastic_env.joint.small_servos import SMALL_SERVOS
 from elastic_env.rigid.tree.end_effector import EndEffector, outermost_body
 
-_RAMP_S = 1.0
+RAMP_S = 1.0
+"""Time in which the compensation grows from zero [s]."""
 _MAX_DEFLECTION_RAD = 1.0
 """Largest deflection that can be compensated, which is the largest `limit_rad` [rad]."""
 
@@ -35,7 +36,8 @@ class ArmOptions(Model):
     end_effector: str | None = None
     """Site or body whose motion is given in questions; default the outermost body."""
     check: bool = True
-    """Move every joint a little first, to check its sign and its load."""
+    """Move every joint a little first, to check its sign and its load; then all together, so that
+    dry friction acts from a known side."""
     nudge_rad: float = quantity("rad", 0.08, ge=0.02, le=0.2)
     """How far, to either side; near a stop, up to three times as far away from it [rad]."""
     dry_run: bool = False
@@ -79,7 +81,7 @@ class ArmSetup:
             model,
             self.mapping if joints is None else joints,
             limit_rad=limit_rad,
-            ramp_s=_RAMP_S,
+            ramp_s=RAMP_S,
             period_s=1.0 / self.settings.rate_hz,
         )
         self.joints = self.compensator.joints

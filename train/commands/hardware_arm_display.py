@@ -25,16 +25,20 @@ def rest_table(rests: Sequence[ArmState], joints: Sequence[str]) -> Table:
     rms = np.sqrt(np.mean(errors**2, axis=0))
     columns = zip(joints, rms, np.abs(errors).max(axis=0), strict=True)
     rows = [[name, f"{error:.1f}", f"{most:.1f}"] for name, error, most in columns]
-    title = f"estimated link from its target at {len(errors)} poses [mrad]"
+    poses = "1 pose" if len(errors) == 1 else f"{len(errors)} poses"
+    title = f"estimated link from its target at {poses} [mrad]"
     return make_table(title, ["joint", "rms", "largest"], rows)
 
 
 @contextlib.contextmanager
 def throttled_display(console: Console) -> Iterator[Callable[[Callable[[], str]], None]]:
-    """Give a function that shows a text now and then: in place at a terminal, else below."""
+    """Give a function that shows a text now and then: in place at a terminal, else below.
+
+    Below, the first text comes after the first period: an arm begins uncompensated.
+    """
     is_redrawn = can_redraw(console)
     period_s = _REDRAW_S if is_redrawn else _REPRINT_S
-    next_s = time.monotonic()
+    next_s = time.monotonic() + (0.0 if is_redrawn else period_s)
     live = Live(console=console, auto_refresh=False) if is_redrawn else None
 
     def show(text: Callable[[], str]) -> None:

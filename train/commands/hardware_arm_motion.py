@@ -20,7 +20,7 @@ from elastic_env.hardware.safety import realtime
 from elastic_env.hardware.safety.supervised_bus import SupervisedBus
 from elastic_env.robots.robot.joints import STIFF_OVER_SERVO
 from train.commands import hardware_arm_dry_run as dry_run
-from train.commands.hardware_arm import ArmSetup
+from train.commands.hardware_arm import RAMP_S, ArmSetup
 from train.commands.hardware_arm_checks import check_joints, check_servos
 from train.commands.hardware_arm_display import rest_table, throttled_display
 from train.commands.hardware_arm_logs import write_servo_logs
@@ -72,6 +72,9 @@ def move_arm(
         start = arm.begin()
         if options.check:
             check_joints(arm, setup, console)
+            arm.resume()
+        for _ in arm.approach_start(RAMP_S, options.nudge_rad if options.check else 0.0):
+            pass
         arm.hold()
         targets = make_targets(start)
         stack.callback(targets.close)
@@ -148,6 +151,8 @@ def _follow_targets(
             finally:
                 file.flush()
                 files = [path, *write_servo_logs(path, setup)]
+    if targets.refused:
+        console.print(f"{targets.refused} lines refused; the last: {targets.problem}", markup=False)
     at_poses = rests if isinstance(targets, Poses) else {}
     _print_summary(arm, at_poses, true_links, setup, console)
     print_files(folder, files, console)

@@ -127,6 +127,21 @@ class Arm:
             self.follower.step(target, self.period_s)
             yield self.cycle(target)
 
+    def approach_start(self, ramp_s: float, way_rad: float) -> Iterator[ArmState]:
+        """Stay until the compensation has grown; then move all joints away from the start and back.
+
+        After that the compensator knows on which side of its dry friction each joint rests.
+
+        Args:
+            ramp_s: Time in which the compensation grows [s].
+            way_rad: Distance, up or at the end of a range down; 0 to stay [rad].
+        """
+        for _ in range(round(ramp_s / self.period_s)):
+            yield self.cycle(self.start)
+        is_below = self.start + way_rad <= self._highest
+        yield from self.go(np.where(is_below, self.start + way_rad, self.start - way_rad))
+        yield from self.go(self.start)
+
     def cycle(self, target: Array) -> ArmState:
         """Run one control cycle at the desired angles."""
         desired = self.follower

@@ -85,7 +85,7 @@ def live_table(state: ArmState, joints: Sequence[str], counts: Counts, targets: 
         )
     lines.append(
         f"{state.time_s:.1f} s, target {targets.number}, {counts.cycles} cycles, {counts.late}"
-        f" late, {counts.held} without all replies, {counts.limited} limited *"
+        f" late, {counts.held} without all replies, {counts.limited} with limited commands (*)"
         + (f", {targets.refused} lines refused" if targets.refused else "")
     )
     return "\n".join(lines)

@@ -1,7 +1,6 @@
 """Servo and IMU instead of the physics: one control cycle is one advance of a `Simulation`."""
 
 import math
-import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -156,10 +155,7 @@ class ServoPlant:
             self.close()
 
     def close(self) -> None:
-        """Switch torque off and close the ports.
-
-        An error or an interrupt that is being handled gets a note that torque is off.
-        """
+        """Switch torque off and close the ports."""
         bus = self._bus
         imu = self._imu
         self._bus = None
@@ -167,9 +163,6 @@ class ServoPlant:
         try:
             if bus is not None:
                 bus.close()
-                error = sys.exception()
-                if error is not None and bus.is_confirmed_off:
-                    error.add_note(f"torque at {self.settings.port} is off")
         finally:
             if imu is not None:
                 imu.close()

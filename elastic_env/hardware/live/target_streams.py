@@ -44,7 +44,6 @@ class Stream(Targets):
         self._pending = b""
         self._target: Array | None = None
         self._is_over = False
-        self.problem = ""
 
     @override
     def next(self, desired: Array, period_s: float) -> Array | None:

@@ -23,11 +23,13 @@ class Targets(ABC):
 
     Attributes:
         refused: Number of lines of a stream that were no targets.
+        problem: Reason of the last refusal; empty without any.
         number: Number of the current target.
     """
 
     def __init__(self) -> None:
         self.refused: int = 0
+        self.problem = ""
         self.number: int = 0
 
     @abstractmethod

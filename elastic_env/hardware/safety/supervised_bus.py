@@ -2,6 +2,7 @@
 
 import contextlib
 import subprocess
+import sys
 import threading
 import time
 from collections.abc import Mapping, Sequence
@@ -71,8 +72,6 @@ class SupervisedBus(contextlib.AbstractContextManager["SupervisedBus"]):
     Attributes:
         models: Model numbers of the servos, a list for each port.
         clock: Clock of the readings.
-        is_confirmed_off: True if all servos have confirmed that their torque is off, and nothing
-            has enabled it since.
 
     Raises:
         PortError: A port cannot be opened.
@@ -91,7 +90,6 @@ class SupervisedBus(contextlib.AbstractContextManager["SupervisedBus"]):
             require_ids(ids)
         self.models: list[list[int]] = []
         self.clock: Clock = time
-        self.is_confirmed_off = False
         self._ports = {port: list(ids) for port, ids in ports.items()}
         self._baudrate = baudrate or BUSES[protocol].rates[0]
         self._protocol: Protocol = protocol
@@ -142,7 +140,6 @@ class SupervisedBus(contextlib.AbstractContextManager["SupervisedBus"]):
         """
         limits = limits or SafetyLimits()
         self._is_enabled = True
-        self.is_confirmed_off = False
         ends = None if ranges is None else ranges.tolist()
         arguments = {"limits": limits.model_dump(), "ranges": ends}
         answer = self._request("enable", self._slow_s, **arguments)
@@ -214,12 +211,12 @@ class SupervisedBus(contextlib.AbstractContextManager["SupervisedBus"]):
         """
         self.stop_keeping()
         self._is_enabled = False
-        self.is_confirmed_off = False
         self._request("disable", _ANSWER_S)
-        self.is_confirmed_off = True
 
     def close(self) -> None:
         """Switch torque off and release the ports; a second call does nothing.
+
+        An error or an interrupt that is being handled gets a note that torque is off.
 
         Raises:
             ReplyError: A servo does not confirm that its torque is off; the ports are released
@@ -229,6 +226,9 @@ class SupervisedBus(contextlib.AbstractContextManager["SupervisedBus"]):
         try:
             if self._is_enabled:
                 self.disable()
+                error = sys.exception()
+                if error is not None:
+                    error.add_note(f"torque at {', '.join(self._ports)} is off")
         finally:
             self._channel.close()
             try:
