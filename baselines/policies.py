@@ -99,19 +99,21 @@ def make(name: str, env: Any, /, **options: Any) -> Policy:
         ConfigurationError: Unknown name or option, one without effect, or an environment that is
             not ours.
     """  # noqa: E501
-    if not hasattr(env.unwrapped, "assumed_model"):
+    inner = getattr(env, "unwrapped", env)
+    if not hasattr(inner, "assumed_model"):
         raise ConfigurationError(
             "a baseline needs an environment with an assumed model, got"
-            f" {type(env.unwrapped).__name__}; make one with"
+            f" {type(inner).__name__}; make one with"
             ' gymnasium.make("elastic_env/Testbed-v0") and pass it here, also if the policy is to'
             " run on a wrapper of it"
         )
+    if not isinstance(name, str):
+        raise unknown_name("policy", name, policy_names())
     if name.startswith(RESIDUAL):
         return _residual_policy(Path(name.removeprefix(RESIDUAL)), env, options)
     if name.startswith(ITERATIVE):
         return _learned_policy(Path(name.removeprefix(ITERATIVE)), env, options)
     given = {option: value for option, value in options.items() if value is not None}
-    chosen = PolicyOptions(**given)
     is_walker = isinstance(env.unwrapped.assumed_model, WalkerModel)
     named = policies_of(is_walker).get(name)
     if named is None:
@@ -123,6 +125,7 @@ def make(name: str, env: Any, /, **options: Any) -> Policy:
             raise ConfigurationError(f"{problem}; {choices_listed('', names)}")
         raise unknown_name(f"policy of the {robot}", name, names)
     _require_effect(name, env, given, named.options)
+    chosen = PolicyOptions(**given)
     return named.build(env, _assumed_model(env, chosen), chosen)
 
 
@@ -156,14 +159,17 @@ def _learned_policy(folder: Path, env: Any, options: dict[str, Any]) -> Policy:
 
 
 def _require_effect(name: str, env: Any, given: Any, usable: tuple[str, ...]) -> None:
-    """Refuse options without effect on a policy."""
+    """Refuse options that do not exist, or have no effect on a policy."""
     takes = f"its options are: {', '.join(usable)}" if usable else "it has no options"
     for option in given:
         if option not in usable:
+            task = env.unwrapped.task.name
+            if option not in PolicyOptions.model_fields:
+                names = usable or PolicyOptions.model_fields
+                raise unknown_name(f"option of {name!r} on the {task}", option, names)
             # of the policies with options only the oracle assumes no stiffness
             is_true = bool(usable) and option in ASSUMED_OPTIONS
             why = f"{option} but knows the true one" if is_true else option
-            task = env.unwrapped.task.name
             raise ConfigurationError(
                 f"the policy {name!r} of the {task} does not use {why}; {takes}"
             )

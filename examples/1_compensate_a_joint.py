@@ -51,5 +51,6 @@ for name, result in results.items():
 ax.set(xlabel="time [s]", ylabel="link error [mrad]")
 ax.legend()
 fig.tight_layout()
+plt.show()
 
 assert results["dynamic"]["link_error_rms_rad"] < results["uncompensated"]["link_error_rms_rad"] / 2

@@ -52,6 +52,7 @@ for name, metrics in walks.items():
 ax.set(xlabel="time [s]", ylabel="roll of the pelvis [mrad]")
 ax.legend()
 fig.tight_layout()
+plt.show()
 
 assert (
     walks["input_output"]["pelvis_error_rms_rad"]

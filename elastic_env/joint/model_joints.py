@@ -1,12 +1,12 @@
 """Joints of a rigid model: names of its hinges, home positions, inertia."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import mujoco
 import numpy as np
 from mujoco import MjModel
 
-from elastic_env.core.errors import ConfigurationError
+from elastic_env.core.errors import ConfigurationError, list_names
 from elastic_env.core.signals import Array
 
 _HINGE = int(mujoco.mjtJoint.mjJNT_HINGE)
@@ -45,6 +45,22 @@ def held_positions(model: MjModel, joints: Sequence[str]) -> dict[int, float]:
     home = home_of(model)
     others = [j for j in range(model.njnt) if model.joint(j).name not in joints]
     return {j: float(home[model.jnt_qposadr[j]]) for j in others}
+
+
+def describe_home(model: MjModel, joints: Iterable[int]) -> str:
+    """List joints with their home positions, such as "elbow at 0.5 rad, finger at 0.01 m".
+
+    Args:
+        model: Compiled rigid model.
+        joints: Numbers of hinges and slides.
+    """
+    home = home_of(model)
+    texts: list[str] = []
+    for j in joints:
+        name = model.joint(j).name or f"joint {j}"
+        unit = "rad" if model.jnt_type[j] == _HINGE else "m"
+        texts.append(f"{name} at {home[model.jnt_qposadr[j]]:.4g} {unit}")
+    return list_names(texts)
 
 
 def mass_matrix(model: MjModel, data: mujoco.MjData) -> Array:

@@ -1,5 +1,6 @@
 """Pictures of MuJoCo models that are only drawn: an image with a caption, or a window."""
 
+import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import Any, TypeAlias
@@ -23,6 +24,7 @@ CAMERA = "front"
 _BACKGROUND = (0.96, 0.97, 0.98)
 _TEXT_RGB = (30, 34, 40)
 _MARGIN = 12
+_WITHOUT_WINDOW = 'make a video by --video FILE, or use render_mode="rgb_array"'
 _CHARACTERS_PER_ROW = 37
 """Width of a picture divided by the size of its letters."""
 
@@ -112,11 +114,12 @@ def _window(model: mujoco.MjModel, data: mujoco.MjData) -> Any:
         import glfw
         import mujoco.viewer as views
     except (ImportError, RuntimeError) as error:
-        raise ElasticError(f"no window can be opened here ({error}); {CURE}") from error
-    if not glfw.init():  # the viewer itself would end the process
-        raise ElasticError(
-            f"no window can be opened here; make a video (--video FILE) or use rgb_array; {CURE}"
-        )
+        raise ElasticError(f"no window can be opened here ({error}); {_WITHOUT_WINDOW}") from error
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", glfw.GLFWError)  # the error below says it
+        has_display = glfw.init()
+    if not has_display:  # the viewer itself would end the process
+        raise ElasticError(f"no window can be opened here; {_WITHOUT_WINDOW}")
     viewer = views.launch_passive(model, data, show_left_ui=False, show_right_ui=False)
     viewer.cam.type = mujoco.mjtCamera.mjCAMERA_FIXED
     viewer.cam.fixedcamid = model.camera(CAMERA).id

@@ -1,6 +1,7 @@
 """An arm, its log and its unknowns, as the options of `elastic identify --robot` name them."""
 
 import fnmatch
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,8 +16,8 @@ from baselines.identification.pose_plan import empty_log
 from baselines.identification.pose_unknowns import PoseUnknowns
 from baselines.identification.static_arm import StaticArm
 from elastic_env.core.errors import unknown_name
-from elastic_env.joint.commanded_joints import commanded_hinges
-from elastic_env.joint.model_joints import hinges_of
+from elastic_env.joint.commanded_joints import commanded_hinges, coupled_fingers
+from elastic_env.joint.model_joints import describe_home, hinges_of
 from elastic_env.world.robot_model import joint_ranges
 from train.commands.identify_options import ArmOptions
 
@@ -47,6 +48,9 @@ class ArmProblem:
 
         Raises:
             ConfigurationError: The log cannot be used, or a name does not exist.
+
+        Warns:
+            UserWarning: The log has no encoder of a joint.
         """
         hinges = hinges_of(model)
         log = None
@@ -54,6 +58,7 @@ class ArmProblem:
             ends = zip(*joint_ranges(model, hinges), strict=True)
             ranges = dict(zip(hinges, ends, strict=True))
             log = read_log(Path(options.log[0]), ranges, options.measured_by)
+            _warn_of_held(model, log.joints)
         joints = commanded_hinges(model) if log is None else log.joints
         arm = StaticArm(model, joints, options.end_effector, options.payload)
         if log is None:
@@ -80,6 +85,18 @@ class ArmProblem:
         has_payload = self.options.payload is not None
         unknowns = PoseUnknowns.from_log(log, self.elastic, frame, has_payload)
         return PoseModel(self.arm, log, unknowns)
+
+
+def _warn_of_held(model: mujoco.MjModel, logged: Sequence[str]) -> None:
+    """Warn of joints that count as held because the log has no encoder of them.
+
+    Coupled fingers need none: the model itself holds them.
+    """
+    known = {*logged, *coupled_fingers(model)}
+    held = [model.joint(name).id for name in hinges_of(model) if name not in known]
+    if held:
+        text = f"joints without a column theta.JOINT are held: {describe_home(model, held)}"
+        warnings.warn(text, stacklevel=3)
 
 
 def _elastic_joints(patterns: Sequence[str], joints: Sequence[str]) -> tuple[str, ...]:

@@ -297,7 +297,14 @@ def _table(figures: list[_Figure]) -> Table:
             interval = ", ".join(map(_text, figure["interval"] or ())) or "-"
             rows.append(Row((figure["metric"], verdict, text, change, *limits, interval)))
     title = "short rollouts against what was accepted"
-    return Table(heads, tuple(rows), title=title, caption="--update accepts what is better.")
+    verdicts = {row.cells[1] for row in rows if row.kind != "heading"}
+    is_better = "better" in verdicts and "falls short" not in verdicts
+    caption = "--update accepts what is better." if is_better else ""
+    table = Table(heads, tuple(rows), title=title, caption=caption)
+    for place in reversed(range(len(heads))):
+        if set(table.column(place)) == {"-"}:
+            table = table.without(place)
+    return table
 
 
 def _change(measured: float | None, accepted: float | None) -> str:

@@ -128,6 +128,11 @@ _INTRODUCTION = (
 )
 _HEAD = ("quantity", "here", "paper")
 _TESTBED = "the paper's testbed experiments, Figs. 5 and 6"
+_PICTURES = (
+    "Deflection under gravity (cf. Fig. 5 of the paper)",
+    "Link error at rest (cf. Fig. 6 of the paper)",
+)
+"""Titles of the pictures of the page."""
 _WALKS = "the paper's walks, Figs. 7 and 8: largest roll and pitch"
 
 
@@ -136,8 +141,8 @@ def _report(rows: Rows, pictures: Sequence[Path], motion: Cells, walks: Cells) -
     page = Page("Demonstration", f"{_INTRODUCTION}.")
     page.section("One joint, at rest")
     page.add("table", Table.plain(_HEAD, rows))
-    for picture in pictures:
-        page.add("picture", picture, picture.stem.replace("_", " "))
+    for picture, title in zip(pictures, _PICTURES, strict=True):
+        page.add("picture", picture, title)
     page.section("One joint, in motion", TEXTS["curves"])
     _add_cells(page, motion)
     page.section("Walks", f"{TEXTS['curves']}{TEXTS['curves_walk']}")
@@ -163,11 +168,12 @@ def _testbed_rows(result: Identification, static: Cells) -> Rows:
     """Return the rows of Figs. 5 and 6."""
     stiffness = f"{result.stiffness_nm_per_rad:.1f}"
     interval = f"{result.stiffness_low_nm_per_rad:.1f} to {result.stiffness_high_nm_per_rad:.1f}"
+    line = f"{result.line_stiffness_nm_per_rad:.1f}"
     rows = [
         ("true stiffness of the plant [N·m/rad]", "1001", "-"),
         ("identified stiffness [N·m/rad]", stiffness, "1001"),
-        ("  95 % interval", interval, "-"),
-        ("  plain line", f"{result.line_stiffness_nm_per_rad:.1f}", "1001"),
+        ("95 % interval of the stiffness [N·m/rad]", interval, "-"),
+        ("stiffness by a plain line [N·m/rad]", line, "1001"),
         ("friction [N·m]", f"{result.friction_nm:.2f}", "-"),
         ("Pearson r", f"{result.pearson_r:.4f}", "0.9775"),
     ]

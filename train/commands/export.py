@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -16,7 +17,7 @@ from elastic_env.core.errors import ConfigurationError, ResultsExistError, short
 from elastic_env.core.files import is_file, write_whole
 from elastic_env.joint.model_text import name_of, read_bytes
 from train.commands.options import StiffnessOrFile, given_options
-from train.export.c_arm import c_header
+from train.export.c_arm import c_header, held_text
 from train.export.c_text import c_example, prefix_of, require_prefix
 
 _WALKER_POLICIES = ("input_output", "adaptive_posture")
@@ -113,13 +114,22 @@ class C(Output):
             name = _short_name(self.model)
         elif self.model in _WALKER_POLICIES:
             program = name = "walker"
+        elif self.model in baselines.policy_names() and not is_file(self.model):
+            raise ConfigurationError(
+                f"the policy {self.model} cannot be exported to C; policies that can:"
+                f" {', '.join(_WALKER_POLICIES)}, {RESIDUAL}PATH"
+            )
         if unused := given_options(self, ["env"] if program == "arm" else _ARM_OPTIONS):
             raise ConfigurationError(
                 f"{', '.join(unused)}: without effect on {shorten(self.model)}; leave it out"
             )
         prefix = prefix_of(name) if self.prefix is None else require_prefix(self.prefix)
         output = self.output or Path(f"{prefix}.h")
-        headers = {"arm": self._arm, "residual": self._residual, "walker": self._walker}
+        headers = {
+            "arm": partial(self._arm, console),
+            "residual": self._residual,
+            "walker": self._walker,
+        }
         files = {output: headers[program](prefix)}
         if self.example:
             folder = output.with_name(f"{prefix}_example")
@@ -144,8 +154,8 @@ class C(Output):
         with closing(make_vector_env(condition, num_envs=1, num_threads=1)) as worlds:
             return c_walker(baselines.make(self.model, worlds), prefix)
 
-    def _arm(self, prefix: str) -> str:
-        """Return the header of an arm."""
+    def _arm(self, console: Console, prefix: str) -> str:
+        """Return the header of an arm, and print which joints are held."""
         if not is_file(self.model):
             raise ConfigurationError(
                 f"no model at {name_of(self.model)}; give a file of MJCF (.xml) or URDF (.urdf)"
@@ -165,6 +175,8 @@ class C(Output):
             period_s=self.period_s,
             friction=self.friction,
         )
+        if held := held_text(compensator.joints, compensator.constants):
+            console.print(held)
         files = [self.model, *([self.joints] if isinstance(self.joints, str) else [])]
         sources = {Path(file).name: read_bytes(Path(file)) for file in files}
         return c_header(compensator, prefix, sources)

@@ -1,14 +1,16 @@
 """`elastic hub`: push residuals to the Hugging Face hub, and pull them."""
 
+import re
 from pathlib import Path
 from typing import Annotated
 
 import tyro
-from pydantic import Field
+from pydantic import field_validator
 from rich.console import Console
 
 from baselines.residual.settings import RESIDUAL
 from elastic_env.core.config import Locator, Model, Title
+from elastic_env.core.errors import quote
 from train.export.hub import pull_residual, push_residual
 
 
@@ -50,12 +52,20 @@ class Pull(Model):
     """OWNER/NAME."""
     revision: Title = "main"
     """Branch, tag or commit."""
-    sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")] | None = None
+    sha256: str | None = None
     """Digest that the weights must have, as elastic hub push prints it."""
     offline: bool = False
     """Contact no server; use the hub's cache of earlier pulls."""
     output: Path | None = None
     """Folder for the residual, new or empty; default hub/OWNER/NAME."""
+
+    @field_validator("sha256")
+    @classmethod
+    def _check_digest(cls, digest: str | None) -> str | None:
+        if digest is not None and not re.fullmatch("[0-9a-f]{64}", digest):
+            form = "64 hexadecimal digits, 0 to 9 and a to f"
+            raise ValueError(f"the digest must be {form}, got {quote(digest)}")
+        return digest
 
     def run(self, console: Console) -> None:
         """Pull the residual, and print its commit and folder."""

@@ -1,5 +1,6 @@
 """`elastic identify --log run.csv`: a servo from logs in time."""
 
+import warnings
 from collections.abc import Sequence
 from contextlib import suppress
 from functools import partial
@@ -15,6 +16,7 @@ from baselines.identification.servo_log import read_servo_log
 from baselines.identification.servo_result import ServoIdentification, describe_servo
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.files import digest_of
+from elastic_env.hardware.buses.servo_models import servo_models
 from elastic_env.joint.model_file import compiled_model
 from train.commands.held_out import number_or_dash
 from train.commands.identify_options import (
@@ -106,18 +108,35 @@ def known_load(options: ServoOptions, robot: str | None, joint: str | None) -> L
 
     Raises:
         ConfigurationError: Half a pendulum, a pendulum besides a robot, or a robot without a joint.
+
+    Warns:
+        UserWarning: No known servo holds the pendulum.
     """
     if (options.mass_kg is None) != (options.lever_m is None):
         raise ConfigurationError("a pendulum needs both --mass-kg and --lever-m")
     if robot is None:
         if options.mass_kg is None or options.lever_m is None:
             return None
-        return Load.pendulum(options.mass_kg, options.lever_m)
+        load = Load.pendulum(options.mass_kg, options.lever_m)
+        _warn_of_heavy(load)
+        return load
     if options.mass_kg is not None:
         raise ConfigurationError("give a pendulum by --mass-kg and --lever-m, or --robot, not both")
     if joint is None:
         raise ConfigurationError("say by --joints which joint of the robot the log is of")
     return Load.from_model(compiled_model(robot), joint)
+
+
+def _warn_of_heavy(pendulum: Load) -> None:
+    """Warn of a weight that no known servo holds, such as a mass in grams."""
+    strongest = max(servo_models().values(), key=lambda servo: servo.largest_torque)
+    if pendulum.torque > strongest.largest_torque:
+        warnings.warn(
+            f"the pendulum pulls with up to {pendulum.torque:.4g} N·m, and {strongest.name}, the"
+            f" strongest known servo, gives {strongest.largest_torque:g} N·m; check --mass-kg [kg]"
+            " and --lever-m [m]",
+            stacklevel=3,
+        )
 
 
 def show_result(result: ServoIdentification, console: Console) -> None:

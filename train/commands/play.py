@@ -128,7 +128,8 @@ def _film(env: Any, episode: Iterable[_Step], period: float, video: Path, show: 
     if is_gif:
         writer: Any = imageio.get_writer(memory, "gif", duration=1e3 * frame_s)
     else:
-        writer = imageio.get_writer(video, fps=1.0 / frame_s)
+        # quiet, since an interrupt makes ffmpeg complain; `_require_whole` finds failures
+        writer = imageio.get_writer(video, fps=1.0 / frame_s, ffmpeg_log_level="quiet")
     try:
         with writer:
             for step, _ in episode:

@@ -19,6 +19,7 @@ from baselines.compensation.position_compensator import CompensatorConstants
 from elastic_env.core.errors import ElasticError
 from elastic_env.core.rotations import matrix_of
 from elastic_env.core.signals import Array
+from elastic_env.joint.model_joints import describe_home, held_positions
 from train.export import c_text
 
 _TEST_STEPS = 12
@@ -160,6 +161,19 @@ def _joint_lines(names: Sequence[str], constants: CompensatorConstants) -> Itera
         bounds = f"{constants.lowest[j]:.4g} to {constants.highest[j]:.4g} rad"
         servo = "" if np.isinf(gain[j]) else f", k_p {gain[j]:.6g} N*m/rad"
         yield f"  {j}  {c_text.plain_text(name)}: K {K[j]:.6g} N*m/rad{servo}, {bounds}"
+    if held := held_text(names, constants):
+        yield f"  {c_text.plain_text(held)}"
+
+
+def held_text(names: Sequence[str], constants: CompensatorConstants) -> str:
+    """Say which joints of the model are held and where; empty if none is.
+
+    Args:
+        names: Joints that are commanded.
+        constants: Constants of their compensator.
+    """
+    held = held_positions(constants.model, names)
+    return f"not commanded, taken as held: {describe_home(constants.model, held)}" if held else ""
 
 
 def _test_vector(compensator: PositionCompensator, prefix: str) -> str:

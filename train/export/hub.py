@@ -226,9 +226,11 @@ def _explain_errors(repository: str, revision: str | None) -> Iterator[None]:
     from huggingface_hub import errors
 
     name = shorten(repository)
+    form = f"a repository is OWNER/NAME, in letters, digits, and . _ -, got {quote(repository)}"
+    if repository.count("/") != 1:
+        raise ConfigurationError(form)
     causes = {
-        errors.HFValidationError: "a repository is OWNER/NAME, in letters, digits, and . _ -, got"
-        f" {quote(repository)}",
+        errors.HFValidationError: form,
         errors.RevisionNotFoundError: f"{name} has no revision {quote(revision)}; give a branch, a"
         " tag or a commit",
         errors.RepositoryNotFoundError: f"no repository {name} that you may use; check its name, or"
@@ -254,7 +256,7 @@ def _explain_errors(repository: str, revision: str | None) -> Iterator[None]:
             f"something else than a hub answers for {name}; check the network, and {_ENDPOINT}"
         ) from None
     except (OSError, HTTPError) as error:
+        cache = "" if revision is None else ", or pull with --offline what was pulled before"
         raise SystemFailedError(
-            f"the hub was not reached ({type(error).__name__}); check the network, or"
-            " pull with --offline what was pulled before"
+            f"the hub was not reached ({type(error).__name__}); check the network{cache}"
         ) from None

@@ -21,8 +21,8 @@ def time_chart(
 ) -> Chart:
     """Chart of signals of the first episodes over time; median and band over training seeds.
 
-    The scale fits walks that go on: a signal may leave the chart shortly before a fall. Strips mark
-    the times in which policies ramp in, and those that are scored.
+    The scale fits walks that go on: a signal may leave the chart during the ramp-in, or shortly
+    before a fall. Strips mark the times in which policies ramp in, and those that are scored.
 
     Args:
         policies: Evaluations with a trace, by title of the policy.
@@ -88,7 +88,7 @@ def _time_marks(trace: Mapping[str, Array]) -> list[Mark]:
     time_s = trace["time_s"]
     ramp = (float(time_s[0]), min(STAND_S, float(time_s[-1])))
     scored = intervals(trace["scored"], time_s)
-    return [Mark("ramp-in", RAMP, [ramp]), Mark("scored", SCORED, scored)]
+    return [Mark("ramp-in, may leave the axes", RAMP, [ramp]), Mark("scored", SCORED, scored)]
 
 
 def _longest_trace(evaluations: Evaluations) -> Mapping[str, Array]:

@@ -124,6 +124,12 @@ class TrainConfig(CodeNamingModel):
             )
         return self
 
+    def training_condition(self, scenario: str) -> Condition:
+        """The cell of the training worlds of a scenario."""
+        arguments = environment(self.env).training_arguments
+        options = arguments | self.env_options | self.training_options
+        return self.condition(scenario, self.base).replace(env_options=options)
+
     @property
     def names_of_code(self) -> list[str]:
         """Names that may refer to a user's code; that of the base never does."""
@@ -202,12 +208,7 @@ def training_worlds(
         ConfigurationError: A name or an option does not exist.
     """
     require_memory("worlds", sum(count for _, count in shares), _WORLD_BYTES)
-    arguments = environment(config.env).training_arguments
-    options = arguments | config.env_options | config.training_options
-    conditions = [
-        config.condition(scenario, config.base).replace(env_options=options)
-        for scenario, _ in shares
-    ]
+    conditions = [config.training_condition(scenario) for scenario, _ in shares]
     weights = [config.weights.get(scenario, 1.0) for scenario, _ in shares]
     worlds = mixed_env(conditions, [count for _, count in shares], threads, weights)
     base = baselines.make(config.base, worlds, **config.base_options)

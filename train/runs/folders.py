@@ -85,10 +85,12 @@ def require_run(folder: Path) -> Path:
     """Return the configuration file of a run that is to be continued.
 
     Raises:
-        ConfigurationError: The folder has no configuration, or contains a link that leads out of
-            it, or something that is neither a file nor a folder.
+        ConfigurationError: The folder is missing, has no configuration, or contains a link that
+            leads out of it, or something that is neither a file nor a folder.
     """
     file = folder / CONFIG
+    if not folder.exists():
+        raise ConfigurationError(f"there is no folder {folder}; name a run's folder")
     if not file.is_file():
         problem = f"{folder} is no run: it has no {CONFIG}; name a run's folder"
         raise ConfigurationError(problem)
@@ -207,8 +209,13 @@ def lock_part(folder: Path, patience_s: float) -> Iterator[None]:
 def result_folder(name: str, output: Path | None = None) -> Iterator[Path]:
     """Create a folder as `create_folder` does, and remove it if the work fails without a result."""
     folder = create_folder(name, output)
-    with _remove_without_result(folder):
-        yield folder
+    try:
+        with _remove_without_result(folder):
+            yield folder
+    except KeyboardInterrupt as error:
+        if not folder.exists():
+            error.add_note(f"nothing was finished, and {folder} is removed")
+        raise
 
 
 @contextmanager
