@@ -223,6 +223,7 @@ def _run(command: list[str], folder: Path | None = None) -> str:
     """
     CONSOLE.print(shorten(" ".join(command).replace("\n", " ")))
     env = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    env["MPLBACKEND"] = "agg"  # a window would wait to be closed
     run = subprocess.run(command, cwd=folder, env=env, capture_output=True, text=True, check=False)
     if run.returncode:
         raise ConfigurationError(f"it ended with {run.returncode}:\n{run.stdout}{run.stderr}")

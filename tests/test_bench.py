@@ -2,18 +2,21 @@
 
 import json
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
+from rich.console import Console
 
+import train.commands.bench
 from elastic_env.core.config import load_yaml
 from elastic_env.core.errors import ConfigurationError
 from train.commands.bench import BenchConfig, find_config
 from train.commands.cli import main
 from train.evaluate.conditions import Condition
-from train.evaluate.episodes import evaluate
+from train.evaluate.episodes import Evaluation, evaluate
 from train.runs.github_annotations import annotation
 
 ROOT = Path(__file__).parents[1]
@@ -22,7 +25,13 @@ QUICK = {"kind": "sine", "duration_s": 0.5, "onset_s": 0.5, "amplitude": 0.1}
 
 @pytest.fixture(autouse=True)
 def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Results of a test go to its own folder."""
+    """Results of a test go to its own folder, and cells are played in this process: starting
+    others takes seconds."""
+
+    def run(conditions: Sequence[Condition], console: Console) -> list[Evaluation]:
+        return [evaluate(condition, num_threads=1) for condition in conditions]
+
+    monkeypatch.setattr(train.commands.bench, "run_conditions", run)
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("GITHUB_STEP_SUMMARY", raising=False)
     monkeypatch.delenv("GITHUB_ACTIONS", raising=False)
@@ -67,6 +76,9 @@ def test_what_was_accepted_is_kept_and_what_got_worse_falls_short(
     assert path.read_text() == before.replace("null", f"{accepted:.4g}")  # comments and order stay
     monkeypatch.setenv("GITHUB_STEP_SUMMARY", "summary.md")
     assert not failed([str(path)])
+    said = capsys.readouterr().out
+    assert "accepts what is better" not in said
+    assert "interval" not in said
     (figure,) = json.loads(Path("runs/bench-3/bench.json").read_text())
     assert figure["measured"] == pytest.approx(accepted, rel=1e-3)
     assert figure["bound"] == pytest.approx(1.05 * accepted)
@@ -150,7 +162,7 @@ def test_an_update_refuses_figures_that_two_cases_share(
     """Catches figures of one case that take the place of another one's, which then falls
     short."""
     path = written()
-    case = "{env: testbed, policy: zero, reference: sine, figures: *a}"
+    case = "{env: testbed, policy: zero, reference: {kind: sine, duration_s: 0.3}, figures: *a}"
     path.write_text(path.read_text().replace("figures:", "figures: &a") + f"- {case}\n")
     before = path.read_bytes()
     with pytest.raises(SystemExit) as end:

@@ -633,7 +633,7 @@ def test_report_needs_nothing_from_outside_and_shows_every_part() -> None:
             cell(evil, {"all": [None, None]}, scenario, reference=reference, time=120),
             *(
                 cell(f"policy {n}", {"all": [n, n + 1.0]}, scenario, reference=reference)
-                for n in range(1, 9)
+                for n in range(1, 3)
             ),
             *family([[1.0, None], [1.5, 1.2]], scenario, reference=reference),
         ]
@@ -888,24 +888,24 @@ def test_words_are_whole_where_there_are_two_residuals() -> None:
         assert (hint in " ".join(text.split())) != has_room
 
 
-@pytest.mark.parametrize("width", [80, 72, 60, 50])
-def test_no_word_of_the_table_of_one_residual_is_broken(width: int) -> None:
-    """Catches mixtu/re and sprea/d on a terminal of the usual width."""
+def test_no_word_of_the_table_of_one_residual_is_broken() -> None:
+    """Catches mixtu/re and sprea/d on a terminal of the usual width, and on narrower ones."""
     rows = []
     for scenario in ("spread", "payload"):
         base = cell("base", {"all": [2.0] * 10}, scenario)
         rows += [base, *family([[0.1 * seed] * 10 for seed in range(1, 12)], scenario)]
     shown = changes(rows, {"mixture of both": ["spread", "payload"]})
-    console = Console(width=width, record=True, file=StringIO())
-    print_changes(shown, console)
-    lines = console.export_text().splitlines()
-    assert {"scenario", "mixture", "spread", "payload", "learned"} <= {
-        word.strip(":,") for line in lines for word in line.split()
-    }
-    assert all(
-        "/" in line for line in lines if "spread" in line or "payload" in line
-    )  # falls stand in the same line
-    assert max(map(len, lines)) <= width
+    for width in (80, 72, 60, 50):
+        console = Console(width=width, record=True, file=StringIO())
+        print_changes(shown, console)
+        lines = console.export_text().splitlines()
+        assert {"scenario", "mixture", "spread", "payload", "learned"} <= {
+            word.strip(":,") for line in lines for word in line.split()
+        }
+        assert all(
+            "/" in line for line in lines if "spread" in line or "payload" in line
+        )  # falls stand in the same line
+        assert max(map(len, lines)) <= width
 
 
 def test_groups_name_scenarios_that_are_played() -> None:

@@ -264,6 +264,7 @@ def test_a_folder_with_results_is_not_overwritten(hub: SmallHub) -> None:
         ("nobody/nothing", "no repository nobody/nothing"),
         ("a/b/c", "a repository is OWNER/NAME"),
         ("../up", "a repository is OWNER/NAME"),
+        ("foo", "a repository is OWNER/NAME, .* got 'foo'"),
     ],
 )
 def test_a_name_of_no_repository_is_one_sentence(name: str, said: str, hub: SmallHub) -> None:
@@ -275,6 +276,16 @@ def test_no_network_is_one_sentence(hub: SmallHub, monkeypatch: pytest.MonkeyPat
     monkeypatch.setenv("HF_ENDPOINT", "http://127.0.0.1:9")
     with pytest.raises(SystemFailedError, match="--offline"):
         pull_residual(REPOSITORY)
+    with pytest.raises(SystemFailedError, match=r"check the network$"):
+        push_residual(SHIPPED, REPOSITORY)
+
+
+def test_a_wrong_digest_is_named_with_its_form(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["hub", "pull", REPOSITORY, "--sha256", "xyz"])
+    said = " ".join(capsys.readouterr().err.split())
+    assert "--sha256: the digest must be 64 hexadecimal digits" in said
+    assert said.endswith("got 'xyz'")
 
 
 def test_a_page_in_the_place_of_the_hub_is_one_sentence(hub: SmallHub) -> None:

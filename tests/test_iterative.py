@@ -32,8 +32,8 @@ from train.evaluate.conditions import Condition, PolicySpec
 from train.evaluate.episodes import evaluate
 
 PERIOD_S = 0.004
-SINE = {"kind": "sine", "amplitude": 0.2, "duration_s": 1.5, "onset_s": 0.5}
-SHORT = LearningGains(trials=4)
+SINE = {"kind": "sine", "amplitude": 0.2, "duration_s": 0.8, "onset_s": 0.3}
+SHORT = LearningGains(trials=3)
 GAIN = ChannelGains(gain=0.5, lead_s=0.0, cutoff_hz=4.0, surprise=1e3, limit=1e3)
 
 
@@ -182,7 +182,7 @@ def test_the_center_of_mass_moves_as_a_pendulum_has_to() -> None:
 def test_every_offset_of_the_walker_acts_against_its_error() -> None:
     """Catches a handle with the wrong sign, in double and in single support, by playing each on
     a real walk."""
-    env = make_walker(5, scenario="ideal", step_period=[0.8, 0.8, 0.8])
+    env = make_walker(5, scenario="ideal", step_period=[0.5, 0.5, 0.5])
     policy = baselines.make("iterative", env)
     size = np.array([5e-3, 5e-3, 0.01, 0.01])
     tables = np.zeros((5, env.unwrapped.task.num_steps + 1, 4))
@@ -252,7 +252,7 @@ def test_the_testbed_learns_from_its_imu_whatever_the_worlds() -> None:
     policy.rehearse(env, 4, told.append)
     measured = np.array([trial.error_rms[:, 0] for trial in told])
     assert (measured[-1] < 0.75 * measured[0]).all()
-    assert [trial.number for trial in told] == [0, 1, 2, 3]
+    assert [trial.number for trial in told] == [0, 1, 2]
     alone = make_testbed()
     single = baselines.make("iterative", alone, learning=SHORT)
     single.rehearse(alone, 5)
@@ -341,7 +341,7 @@ def test_what_was_learned_is_saved_and_played(run: Path) -> None:
 
 def test_another_motion_or_robot_is_refused(run: Path) -> None:
     """Catches offsets that are played in a motion that they are wrong for."""
-    for change in ({"amplitude": 0.1}, {"duration_s": 1.0}):
+    for change in ({"amplitude": 0.1}, {"duration_s": 0.6}):
         env = make_testbed(reference={**SINE, **change})
         with pytest.raises(ConfigurationError, match=r"amplitude|number of rows"):
             baselines.make(f"iterative:{run}", env)

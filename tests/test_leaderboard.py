@@ -396,7 +396,7 @@ def write_board(policies: Sequence[Any]) -> None:
     content = {
         "name": "board",
         "env": "walker",
-        "references": [{"step_period": 1.1, "num_steps": 1}],
+        "references": [{"step_period": [0.2, 0.3, 0.2], "num_steps": 1}],
         "leaderboard": True,
         "scenarios": ["ideal"],
         "groups": {"mixture": ["ideal"]},

@@ -385,7 +385,7 @@ def test_unknown_option_names_itself_and_the_choices() -> None:
     """Catches an option that is silently ignored because it is spelt wrong."""
     with pytest.raises(
         ConfigurationError,
-        match=r"'stifness'.*stiffness, stiffness_scale, output, gravity, com_feedback, gains",
+        match=r"'input' on the testbed 'stifness'; .*: stiffness, .*, gravity, ramp_s\..*'stiffness'",
     ):
         baselines.make("input", scalar(), stifness=900.0)
 
@@ -415,6 +415,15 @@ def test_an_environment_that_is_not_ours_is_named(name: str) -> None:
     """Catches an AttributeError of a folder that is read before the environment is looked at."""
     with pytest.raises(ConfigurationError, match="an assumed model, got CartPoleEnv; make one"):
         baselines.make(name, gymnasium.make("CartPole-v1"))
+
+
+def test_arguments_of_the_wrong_type_are_one_sentence() -> None:
+    """Catches an AttributeError."""
+    number: Any = 3
+    with pytest.raises(ConfigurationError, match="assumed model, got NoneType"):
+        baselines.make("input", None)
+    with pytest.raises(ConfigurationError, match="unknown policy 3; choose one of: zero"):
+        baselines.make(number, scalar())
 
 
 def test_oracle_takes_no_stiffness() -> None:

@@ -83,6 +83,15 @@ def test_a_run_that_cannot_be_described_leaves_no_folder(
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_folder_that_ctrl_c_removes_is_named() -> None:
+    """Catches a run that disappears without a word, and a missing folder without a config.yaml."""
+    with pytest.raises(KeyboardInterrupt) as caught, run_folder("mine", {}, 0):
+        raise KeyboardInterrupt
+    assert caught.value.__notes__ == ["nothing was finished, and runs/mine is removed"]
+    with pytest.raises(ConfigurationError, match="there is no folder runs/mine; name a run"):
+        require_run(Path("runs/mine"))
+
+
 def full_at(name: str) -> Callable[..., None]:
     """`write_whole` on a disk that gets full at a file."""
 

@@ -140,15 +140,15 @@ CRITIC: dict[str, Any] = {
     "reference": [0.3, 0.4, 0.3],
     "scenarios": ["drawn"],
     "base": "foothold",
-    "worlds": 4,
-    "decisions": 32,
-    "evaluate_every": 32,
-    "checkpoint_every": 32,
+    "worlds": 2,
+    "decisions": 16,
+    "evaluate_every": 16,
+    "checkpoint_every": 16,
     "evaluation_episodes": 1,
     "env_options": {"num_steps": 1},
     "settings": {"observe": ["clock.swing", "standing", "landing"], "mirror": True},
     "critic_sees": ["load", "mounting"],
-    "algorithm_options": {"n_steps": 8, "batch_size": 16, "n_epochs": 2},
+    "algorithm_options": {"n_steps": 8, "batch_size": 8, "n_epochs": 2},
 }
 
 

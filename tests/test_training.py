@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -37,8 +38,9 @@ from train.evaluate.progress import read_progress
 from train.evaluate.rollout import make_vector_env
 from train.learn.constant_search import ConstantSearch
 from train.learn.mixed_env import MixedVectorEnv, thread_counts
+from train.learn.run_training import Run, _name_resumption, _score_table, resume
 from train.learn.run_training import _change_text as change_in_words
-from train.learn.run_training import resume
+from train.learn.run_training import _warn_of_cut_episodes as warn_of_cut_episodes
 from train.learn.sb3_env import SB3VecEnv
 from train.learn.tensorboard_curves import RewardLogger
 from train.learn.train_config import TrainConfig, training_worlds
@@ -48,17 +50,17 @@ from train.runs.folders import lock_run
 from train.workers.executors import Executors
 
 ROOT = Path(__file__).parents[1]
-SINE = {"kind": "sine", "duration_s": 1.0, "onset_s": 0.5, "amplitude": 0.1}
+SINE = {"kind": "sine", "duration_s": 0.3, "onset_s": 0.2, "amplitude": 0.1}
 SMALL: dict[str, Any] = {
     "env": "testbed",
     "reference": SINE,
     "base": "input",
     "worlds": 4,
-    "decisions": 192,
+    "decisions": 128,
     "evaluate_every": 96,
     "checkpoint_every": 64,
     "evaluation_episodes": 1,
-    "settings": {"decision_period": 50, "history": 1},
+    "settings": {"decision_period": 30, "history": 1},
 }
 PPO = {"algorithm_options": {"n_steps": 8, "batch_size": 16, "n_epochs": 2}, "anneal": True}
 SAC = {
@@ -192,7 +194,7 @@ def test_episodes_that_checkpoints_end_have_their_reward_per_decision(
 ) -> None:
     """Catches a curve without a point, as every checkpoint ends the episodes before one is whole,
     and a last point of fewer decisions than the others."""
-    settings = {"decision_period": 25, "history": 1}
+    settings = {"decision_period": 22, "history": 1}
     sizes = {"decisions": 160, "checkpoint_every": 64}
     training = Training(TrainConfig(**{**SMALL, **PPO, **sizes, "settings": settings}), 1, tmp_path)
     rewards = []
@@ -220,7 +222,7 @@ def test_an_episode_that_is_cut_short_has_no_statistics() -> None:
     worlds = SB3VecEnv(wrapped(n=4), np.random.default_rng(0))
     worlds.reset()
     lengths = []
-    for _ in range(120):
+    for _ in range(75):
         worlds.step_async(np.zeros((4, 1)))
         infos = worlds.step_wait()[3]
         lengths += [(info.get("episode") or {}).get("l") for info in infos if info]
@@ -247,15 +249,16 @@ def test_nan_ends_a_training_with_one_sentence(
     part: int, quantity: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """Catches a traceback of torch, a checkpoint that holds nan, and one that is lost."""
-    training = Training(TrainConfig(**{**SMALL, **PPO}), 1, tmp_path)
-    spoilt(training._worlds, 20, part, monkeypatch)
+    config = TrainConfig(**{**SMALL, **PPO, "checkpoint_every": 32})
+    training = Training(config, 1, tmp_path)
+    spoilt(training._worlds, 10, part, monkeypatch)
     message = (
-        rf"{quantity} is not a finite number at decision 8\d of training seed 1; the checkpoint of"
-        r" decision 64 is"
+        rf"{quantity} is not a finite number at decision 4\d of training seed 1; the checkpoint of"
+        r" decision 32 is"
     )
     with pytest.raises(ElasticError, match=message):
         training.run()
-    assert Training(TrainConfig(**{**SMALL, **PPO}), 1, tmp_path).done == 64
+    assert Training(config, 1, tmp_path).done == 32
 
 
 @pytest.mark.parametrize(
@@ -271,6 +274,35 @@ def test_nan_ends_a_training_with_one_sentence(
 def test_scores_without_an_episode_are_a_dash(base: float, mine: float, said: str) -> None:
     """Catches nan → nan (+nan %)."""
     assert change_in_words(base, mine, 1e3) == said
+
+
+def test_checkpoints_within_half_an_episode_are_warned_of() -> None:
+    """Catches worlds that only ever see the begin of an episode; one has 13 decisions here."""
+    config = TrainConfig(**{**SMALL, "checkpoint_every": 25})
+    with pytest.warns(UserWarning, match="4 worlds after about 6 of 13 decisions; .* set 26 or"):
+        warn_of_cut_episodes(config)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warn_of_cut_episodes(config.replace(checkpoint_every=26))
+        warn_of_cut_episodes(config.replace(decisions=25))  # no checkpoint before the end
+
+
+def test_a_policy_that_is_worse_than_its_base_is_named(tmp_path: Path) -> None:
+    head = "decisions,scenario,link_error_rms_rad,base_link_error_rms_rad,failed\n"
+    for seed, score in ((3, 0.003), (4, 0.001)):
+        (tmp_path / f"seed_{seed}").mkdir()
+        text = f"{head}8,nominal,{score},0.002,0\n"
+        (tmp_path / f"seed_{seed}" / "progress.csv").write_text(text)
+    table = _score_table(TrainConfig(**SMALL, seeds=[3, 4]), tmp_path)
+    assert table.caption == "on average worse than input: seed 3"
+
+
+def test_ctrl_c_names_the_command_that_continues(tmp_path: Path) -> None:
+    runs = [Run(TrainConfig(**SMALL), tmp_path)]
+    (tmp_path / "seed_0").mkdir()
+    with pytest.raises(KeyboardInterrupt) as caught, _name_resumption(runs):
+        raise KeyboardInterrupt
+    assert caught.value.__notes__ == [f"go on with: elastic train --resume {tmp_path}"]
 
 
 def test_weights_that_are_nan_are_named(tmp_path: Path) -> None:
@@ -299,9 +331,9 @@ def test_a_search_whose_reward_is_nan_says_so(
 
 def test_a_damaged_checkpoint_is_named(tmp_path: Path) -> None:
     """Catches errors of libraries in the place of one that says which files, and what to do."""
-    config = TrainConfig(**{**SMALL, **PPO})
+    config = TrainConfig(**{**SMALL, **PPO, "checkpoint_every": 32})
     with pytest.raises(KeyboardInterrupt):
-        Training(config, 1, tmp_path / "whole").run(interrupted_after(96))
+        Training(config, 1, tmp_path / "whole").run(interrupted_after(64))
     for file in ("model.pt", "state.json", "state.npz"):
         for size in (None, 0, 100):
             folder = Path(shutil.copytree(tmp_path / "whole", tmp_path / f"{file} {size}"))
@@ -632,7 +664,7 @@ def test_train_command_trains_every_seed_and_resumes(
     """Catches a seed left out, seeds that differ side by side, policies without a player, a
     resume that begins anew."""
     monkeypatch.chdir(tmp_path)
-    given = {"name": "mine", **SMALL, **PPO, "seeds": [3, 4], "decisions": 64}
+    given = {"name": "mine", **SMALL, **PPO, "seeds": [3, 4], "decisions": 32}
     Path("c.yaml").write_text(yaml.safe_dump(given))
     main(["train", "c.yaml", "--jobs", jobs])
     Training(TrainConfig(**given), 4, tmp_path / "alone").run()
@@ -652,7 +684,7 @@ def test_train_command_trains_every_seed_and_resumes(
     assert "runs/mine is complete" in capsys.readouterr().out
     assert Path("runs/mine/seed_3/last/weights.safetensors").read_bytes() == before
     policy = "residual:runs/mine/seed_3/last"
-    short = "{kind: sine, duration_s: 0.5, onset_s: 0.5, amplitude: 0.1}"
+    short = "{kind: sine, duration_s: 0.3, onset_s: 0.2, amplitude: 0.1}"
     main(["evaluate", "--policy", policy, "--reference", short, "--output", "e"])
     with Path("e/episodes.csv").open(newline="") as file:
         (row,) = csv.DictReader(file)
@@ -869,7 +901,7 @@ def test_the_right_model_is_rewarded() -> None:
     for residual in (-0.5, 0.0, 0.5):
         env.reset(seed=0)
         total = 0.0
-        for _ in range(50):
+        for _ in range(37):
             _, reward, _, _, _ = env.step(np.full((2, 1), residual))
             total += float(reward.sum())
         rewards.append(total)
