@@ -9,27 +9,52 @@ import pytest
 from tests.fingerprints import Case, cases, fingerprint, numerics, recorded
 
 _OF_THEIR_OWN_KIND = ("spread", "backlash", "sensor", "imu", "push", "foot_sensors")
+_ON_THE_WALKER_ALONE = ("spread", "sensor")
+"""Seven of their robots take seconds to settle."""
+_PARTS_OF_OTHERS = (
+    "zero",  # plays a whole walk
+    "input",  # plays a whole walk
+    "uncompensated_open",
+    "uncompensated",
+    "input_open",
+    "input_output",  # plays the scenarios
+    "adaptive",
+    "posture",
+)
+"""Policies of the walker whose code plays in those of other rows too."""
 
 
 def _played() -> list[Any]:
     """Each scenario in a vector environment, each policy and each whole episode in a scalar one.
 
-    Every commit plays the scenarios that do more than scale a parameter.
+    Every commit plays the scenarios that do more than scale a parameter, two of the walker in one
+    world alone, and the policies that others do not contain.
     """
     chosen = [
         case
         for case in cases()
         if (case.worlds == 1) == (case.scenario == "nominal" or case.arguments != "{}")
+        or _is_of_one_walker(case)
     ]
     return [
-        pytest.param(case, id=case.name, marks=[pytest.mark.slow] * _differs_by_a_number(case))
+        pytest.param(case, id=case.name, marks=[pytest.mark.slow] * _repeats_others(case))
         for case in chosen
     ]
 
 
-def _differs_by_a_number(case: Case) -> bool:
-    """A scenario that differs from others by a number alone."""
-    return case.worlds > 1 and case.scenario not in _OF_THEIR_OWN_KIND
+def _is_of_one_walker(case: Case) -> bool:
+    """One world of a scenario of the walker, of which many take long."""
+    is_whole = case.arguments != "{}"
+    return case.env == "walker" and case.scenario in _ON_THE_WALKER_ALONE and not is_whole
+
+
+def _repeats_others(case: Case) -> bool:
+    """A scenario that differs from others by a number alone, many worlds of what one world shows,
+    or a policy that is a part of others."""
+    if case.worlds > 1:
+        return case.scenario not in _OF_THEIR_OWN_KIND or _is_of_one_walker(case)
+    is_nominal = case.scenario == "nominal" and case.arguments == "{}"
+    return case.env == "walker" and is_nominal and case.policy in _PARTS_OF_OTHERS
 
 
 def test_every_case_is_recorded() -> None:

@@ -102,7 +102,7 @@ def test_feet_that_land_off_by_a_constant_come_to_their_footholds() -> None:
 
 def test_a_force_sensor_that_is_off_does_not_let_the_feet_walk_away() -> None:
     """Catches errors that add up: left and right take turns, so a constant one must not."""
-    legs = ClosedLegs(walker(num_steps=40))
+    legs = ClosedLegs(walker(num_steps=16))
     bias_n = 10.0
     legs.walk(bias_n)
     wide = GAINS.compliance_m_n * bias_n / 2.0
@@ -134,13 +134,13 @@ def test_an_offset_that_goes_before_the_load_comes_needs_no_true_compliance() ->
     drift = []
     for return_load in (1.0, 0.25):
         gains = GAINS.replace(return_load=return_load, load_rate_m_s=0.0)
-        legs = ClosedLegs(walker(num_steps=40), gains)
+        legs = ClosedLegs(walker(num_steps=16), gains)
         legs.load_rate_m_s = 0.0
         legs.compliance_m_n = GAINS.compliance_m_n / 1.25
         legs.landing_m = np.full((2, 2), [0.005, 0.0])
         legs.walk()
         drift.append(np.abs(legs.place).max())
-    assert drift[0] == pytest.approx(40 * 0.5e-3, rel=0.2)
+    assert drift[0] == pytest.approx(16 * 0.5e-3, rel=0.2)
     assert drift[1] < 1e-4
 
 

@@ -152,7 +152,10 @@ def test_a_step_before_the_reset_is_refused(name: str) -> None:
     many.step(np.zeros(many.action_space.shape, dtype=np.float32))
 
 
-@pytest.mark.parametrize("name", IDS)
+@pytest.mark.parametrize(
+    "name",  # robots of any joints are drawn as the testbed is
+    [pytest.param(n, marks=[pytest.mark.slow] * ("Robot-v0" in n)) for n in IDS],
+)
 def test_a_vector_environment_draws_its_worlds(name: str) -> None:
     """Catches frames that all show the first world."""
     env = make_vec(name, 2, render_mode="rgb_array", scenario="nominal")

@@ -207,7 +207,7 @@ def test_the_commands_play_and_compare_it(tmp_path: Path, monkeypatch: pytest.Mo
     ("arguments", "message"),
     [
         ({"scenario": "slope"}, "only a walker knows"),
-        ({"stiffness": [100.0, 200.0]}, "3 of them"),
+        ({"stiffness": [100.0, 200.0]}, "a list of 3"),
         (
             {"reference": {"kind": "sine", "amplitude": 3.0, "frequency_hz": 2.0}},
             "can need .* of a servo limited to 150",

@@ -1,5 +1,6 @@
 """Pictures: shape and type, and that one sees in them what they are for."""
 
+import warnings
 from itertools import pairwise
 from types import SimpleNamespace
 from typing import Any
@@ -10,9 +11,10 @@ import numpy as np
 import pytest
 
 import elastic_env  # noqa: F401  registers the environments
-from elastic_env.core.errors import ConfigurationError
+from elastic_env.core.errors import ConfigurationError, ElasticError
 from elastic_env.core.signals import Array, Signals
 from elastic_env.rendering.deviation_picture import ENLARGEMENT, enlarge_deviation
+from elastic_env.rendering.picture import _window
 from elastic_env.rigid.leg_kinematics import rotation_x, rotation_y
 from elastic_env.robots.testbed.model import Pendulum
 from elastic_env.robots.testbed.picture import TestbedPicture
@@ -159,6 +161,23 @@ def test_without_render_mode_there_is_no_picture() -> None:
     env = gymnasium.make(ID).unwrapped
     env.reset(seed=0)
     assert env.render() is None
+
+
+def test_a_machine_without_a_display_is_told_of_videos(
+    monkeypatch: pytest.MonkeyPatch, recwarn: pytest.WarningsRecorder
+) -> None:
+    """Catches GLFW's own warning before the error."""
+    glfw = pytest.importorskip("glfw")
+
+    def fail() -> bool:
+        warnings.warn("X11: no display", glfw.GLFWError, stacklevel=2)
+        return False
+
+    monkeypatch.setattr(glfw, "init", fail)
+    model = mujoco.MjModel.from_xml_string("<mujoco/>")
+    with pytest.raises(ElasticError, match="make a video by --video FILE"):
+        _window(model, mujoco.MjData(model))
+    assert not recwarn
 
 
 def test_unknown_render_mode_lists_the_choices() -> None:

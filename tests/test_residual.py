@@ -7,6 +7,7 @@ import os
 import re
 import shutil
 import subprocess
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -118,11 +119,11 @@ def test_a_zero_residual_is_the_base_to_the_last_bit(robot: str, base: str, acts
     """Catches a correction that rounds, a filter that starts elsewhere, and a base that sees it
     normalised."""
     env = scalar(robot)
-    expected = played(env, baselines.make(base, env), 250)
+    expected = played(env, baselines.make(base, env), 120)
     corrected = around(env, base, acts_on={acts_on: None})
     for seen in (
-        played(env, Deciding(corrected, np.zeros((20, corrected.num_residuals))), 250),
-        played(env, ResidualPolicy(corrected, nothing(corrected)), 250),
+        played(env, Deciding(corrected, np.zeros((20, corrected.num_residuals))), 120),
+        played(env, ResidualPolicy(corrected, nothing(corrected)), 120),
     ):
         assert len(seen) == len(expected) > 100
         for one, other in zip(seen, expected, strict=True):
@@ -253,7 +254,7 @@ def test_a_vector_of_worlds_is_the_scalar_wrapper(
     """Catches rewards that go on after an end, worlds that begin inside a decision, and memories
     that are mixed up."""
     further = {"history": 2, "observe": ["observation", "base_action"], "decision_period": 20}
-    n = 3
+    n = 2
     generator = np.random.default_rng(0)
     many = ResidualVectorWrapper(vector(robot, n, mode), base, acts_on={acts_on: None}, **further)
     ones = [
@@ -289,7 +290,7 @@ def test_a_vector_of_worlds_is_the_scalar_wrapper(
                 np.testing.assert_array_equal(observation[i], one.reset()[0])
             else:
                 ended[i] = True
-    assert ends >= 3
+    assert ends >= 2
 
 
 def test_restarts_in_a_row_lose_nothing() -> None:
@@ -573,6 +574,15 @@ def test_features_that_do_not_exist_are_refused(
         Features(around(vector(robot, 2), base, observe=observe))
 
 
+@cache
+def robot_of(robot: str) -> Any:
+    """An environment whose policies every shipped residual of the robot can correct."""
+    walk = {"step_period": 1.1, "num_steps": 1}  # which has a table over the phase
+    options = {"robot": {"sensors": ["link_encoder"]}, "walker": walk}
+    kinds = {"robot": "elastic_env/Robot-v0", "walker": WALKER, "testbed": TESTBED}
+    return gymnasium.make(kinds[robot], **options.get(robot, {}))
+
+
 @pytest.mark.parametrize("name", shipped_names())
 def test_residuals_that_come_with_the_package_are_found_by_name(
     name: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
@@ -580,11 +590,7 @@ def test_residuals_that_come_with_the_package_are_found_by_name(
     """Catches a name that only works in the source tree, and a folder that was damaged or left
     out."""
     monkeypatch.chdir(tmp_path)
-    robot = read_description(Path(name)).robot
-    walk = {"step_period": 1.1, "num_steps": 1}  # which has a table over the phase
-    options = {"robot": {"sensors": ["link_encoder"]}, "walker": walk}
-    kinds = {"robot": "elastic_env/Robot-v0", "walker": WALKER, "testbed": TESTBED}
-    env = gymnasium.make(kinds[robot], **options.get(robot, {}))
+    env = robot_of(read_description(Path(name)).robot)
     policy: Any = baselines.make(f"residual:{name}", env)
     assert policy.corrected.settings == read_description(Path(name)).settings
 
@@ -780,8 +786,8 @@ def test_a_folder_that_is_no_residual_says_what_is_needed(tmp_path: Path) -> Non
 @pytest.mark.parametrize("mode", list(AutoresetMode))
 def test_the_environment_under_a_wrapper_stays_as_it_was(mode: AutoresetMode) -> None:
     """Catches a wrapper that changes how the caller's own environment restarts."""
-    env = vector("testbed", 2, mode)
-    alone = vector("testbed", 2, mode)
+    moment = {"kind": "sine", "duration_s": 0.1, "onset_s": 0.1, "amplitude": 0.02}
+    env, alone = (vector("testbed", 2, mode, reference=moment) for _ in range(2))
     wrapped = ResidualVectorWrapper(env, "input")
     wrapped.reset(seed=3)
     wrapped.step(np.zeros(wrapped.action_space.shape))

@@ -210,7 +210,13 @@ def test_the_imu_is_zeroed_where_the_joint_hangs(middle: float, expected: float)
     assert states[-1].joints.offset[0, 0] == pytest.approx(expected, abs=1e-4)
 
 
-@pytest.mark.parametrize("scenario", ["nominal", "soft", "stiff", "payload", "backlash", "sensor"])
+@pytest.mark.parametrize(
+    "scenario",
+    [
+        *("soft", "backlash", "sensor"),
+        *(pytest.param(name, marks=pytest.mark.slow) for name in ("nominal", "stiff", "payload")),
+    ],
+)
 def test_the_observer_is_stable_in_every_scenario(scenario: str) -> None:
     """Catches a loop through the resonance: after quick steps the link is still, in the last
     half second of a rest."""

@@ -258,10 +258,10 @@ def open_loop() -> Recording:
 # --------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("scenario", ["nominal", HARD])
-def test_gymnasium_check_env(scenario: str) -> None:
-    """Catches spaces, dtypes, seeding and return types that are not Gymnasium's."""
-    check_env(gymnasium.make(ID, **SHORT, scenario=scenario).unwrapped, skip_render_check=True)
+def test_gymnasium_check_env() -> None:
+    """Catches spaces, dtypes, seeding and return types that are not Gymnasium's, where much is
+    drawn."""
+    check_env(gymnasium.make(ID, **SHORT, scenario=HARD).unwrapped, skip_render_check=True)
 
 
 def test_make_and_make_vec_find_the_environments() -> None:
@@ -482,7 +482,9 @@ def test_a_world_of_the_vector_is_the_scalar_environment_for_a_whole_episode(
     assert info["time_s"][1] == 0.0  # begun anew
 
 
-@pytest.mark.parametrize("scenario", SCENARIOS)
+@pytest.mark.parametrize(
+    "scenario", [f"{HARD}+slope", *(pytest.param(s, marks=pytest.mark.slow) for s in SCENARIOS)]
+)
 def test_results_depend_neither_on_threads_nor_on_the_number_of_worlds(scenario: str) -> None:
     """Catches a world whose noise, robot or physics depends on its neighbours or on who computes
     it."""
@@ -555,7 +557,9 @@ def assert_info_of_rows(info: dict[str, Any], expected: dict[str, Any], path: st
 
 
 @pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
-@pytest.mark.parametrize("scenario", [*SCENARIOS, HARD])
+@pytest.mark.parametrize(
+    "scenario", [f"{HARD}+slope", *(pytest.param(s, marks=pytest.mark.slow) for s in SCENARIOS)]
+)
 def test_worlds_that_end_at_different_times_keep_apart(scenario: str, mode: AutoresetMode) -> None:
     """Catches an end in one world that shows in the results of another: masks of reset, fall and
     divergence."""
@@ -587,13 +591,13 @@ def test_one_seed_per_world_or_an_error() -> None:
 def test_random_actions_end_in_falls_with_a_reason_and_never_in_bad_numbers() -> None:
     """Catches NaN in what a learner sees, ends without a reason, and a world that starts anew
     without a word."""
-    env = walk_worlds(64, autoreset_mode=AutoresetMode.SAME_STEP)
+    env = walk_worlds(16, autoreset_mode=AutoresetMode.SAME_STEP)
     _, info = env.reset(seed=0)
     time = info["time_s"]
     qpos = env.simulation.qpos.copy()
     ends = 0
-    held = np.repeat(random_actions(6, 64, seed=1, size=0.3), 25, axis=0)
-    for actions in np.clip(held + random_actions(150, 64, size=0.3), -0.3, 0.3):
+    held = np.repeat(random_actions(6, 16, seed=1, size=0.3), 25, axis=0)
+    for actions in np.clip(held + random_actions(150, 16, size=0.3), -0.3, 0.3):
         observation, reward, terminated, truncated, info = env.step(actions)
         done = terminated | truncated
         assert np.isfinite(observation).all()
@@ -618,7 +622,7 @@ def test_random_actions_end_in_falls_with_a_reason_and_never_in_bad_numbers() ->
         time = info["time_s"]
         qpos = env.simulation.qpos.copy()
         ends += int(done.sum())
-    assert ends > 16
+    assert ends > 4
 
 
 # --------------------------------------------------------------------------------------------------
@@ -628,7 +632,13 @@ def test_random_actions_end_in_falls_with_a_reason_and_never_in_bad_numbers() ->
 
 @pytest.mark.parametrize(
     "scenario",
-    ["ideal", "nominal", "soft", "payload", "spread", "sensor", "backlash", "slope", "ideal+slope"],
+    [
+        *("ideal", "payload", "spread", "sensor", "backlash", "slope"),
+        *(
+            pytest.param(name, marks=pytest.mark.slow)
+            for name in ("nominal", "soft", "ideal+slope")
+        ),
+    ],
 )
 def test_an_episode_starts_in_static_equilibrium(scenario: str) -> None:
     """Catches a start with slack springs or an empty integrator: while the command stays,
@@ -1020,12 +1030,17 @@ def test_a_push_gives_the_robot_its_impulse_once_within_the_walk() -> None:
     for env in (pushed, calm):
         lean(env, height_m=100.0)  # where no foot can brace itself; both fall alike
     forces = []
-    momenta = []
+    states = []
     for _ in range(WALK_END + 30):
         for env in (pushed, calm):
             env.step(zeros())
         forces.append(pushed.simulation.bind("xfrc_applied")[0].copy())
-        momenta.append(momentum(pushed) - momentum(calm))
+        states.append(
+            [
+                (env.simulation.qpos[0].copy(), env.simulation.qvel[0].copy())
+                for env in (pushed, calm)
+            ]
+        )
     push = np.array(forces)[:, pushed.simulation.model.body("upper_body").id, :3]
     begin, *_, end = np.flatnonzero(push.any(axis=1))
     assert WALK_BEGIN <= begin < WALK_END
@@ -1033,17 +1048,20 @@ def test_a_push_gives_the_robot_its_impulse_once_within_the_walk() -> None:
     np.testing.assert_allclose(np.linalg.norm(push[begin : end + 1], axis=1), 50.0)
     assert not push[:, 2].any()
     assert np.sum(forces) == np.sum(push)  # on the torso alone
-    assert np.abs(momenta[begin - 1]).max() == 0.0
-    np.testing.assert_allclose(momenta[end], 0.1 * push[begin], rtol=0.0, atol=0.02)
-    np.testing.assert_allclose(momenta[-1], momenta[end], rtol=0.0, atol=0.02)
+    before, after, last = (
+        np.subtract(*(momentum(pushed.simulation.model, *state) for state in states[step]))
+        for step in (begin - 1, end, -1)
+    )
+    assert np.abs(before).max() == 0.0
+    np.testing.assert_allclose(after, 0.1 * push[begin], rtol=0.0, atol=0.02)
+    np.testing.assert_allclose(last, after, rtol=0.0, atol=0.02)
 
 
-def momentum(env: ElasticEnv) -> Array:
+def momentum(model: mujoco.MjModel, qpos: Array, qvel: Array) -> Array:
     """Linear momentum of the robot, (3,) [N·s]."""
-    model = env.simulation.model
-    data = mujoco.MjData(env.simulation.model)
-    data.qpos[:] = env.simulation.qpos[0]
-    data.qvel[:] = env.simulation.qvel[0]
+    data = mujoco.MjData(model)
+    data.qpos[:] = qpos
+    data.qvel[:] = qvel
     mujoco.mj_forward(model, data)
     mujoco.mj_subtreeVel(model, data)
     pelvis = model.body("pelvis").id
@@ -1052,24 +1070,24 @@ def momentum(env: ElasticEnv) -> Array:
 
 def test_pushes_begin_at_drawn_times_in_drawn_directions_and_end_with_the_episode() -> None:
     """Catches one push for all worlds, and a force that stays on a robot that begins anew."""
-    env = walk_worlds(32, scenario="push", autoreset_mode=AutoresetMode.SAME_STEP)
+    env = walk_worlds(12, scenario="push", autoreset_mode=AutoresetMode.SAME_STEP)
     env.reset(seed=0)
     torso = env.task.model.body("upper_body").id
     force = env.simulation.bind("xfrc_applied")[:, torso]
     env.simulation.qpos[:, 2] += 100.0
-    seen = np.zeros(32)
+    seen = np.zeros(12)
     for k in range(WALK_BEGIN + 60):
-        env.step(zeros(32))
+        env.step(zeros(12))
         pushed = force.any(axis=1)
         assert k >= WALK_BEGIN or not pushed.any()
         seen += pushed
     angles = np.arctan2(force[pushed, 1], force[pushed, 0])
-    assert 2 <= pushed.sum() < 32
+    assert 2 <= pushed.sum() < 12
     assert np.ptp(angles) > 0.5
     assert len(np.unique(seen)) > 3
     worlds = np.flatnonzero(pushed)
     env.reset(options={"reset_mask": pushed})
-    env.step(zeros(32))
+    env.step(zeros(12))
     assert not force[worlds].any()
 
 

@@ -10,7 +10,9 @@ from elastic_env.core.errors import ConfigurationError
 from elastic_env.robots.thormang.environment import make as make_walk
 from elastic_env.robots.thormang.environment import make_vector as make_walk_vector
 
-STEP_S = 1.6
+STEP_S = 1.1
+ROWS = 275
+"""Control steps of a step."""
 DRAWN: dict[str, Any] = {"step_period": STEP_S, "num_steps": 10, "fewest_steps": 4}
 NO_OFFSET = np.zeros(12, np.float32)
 
@@ -24,7 +26,7 @@ def shortest_walk(env: Any) -> int:
     """A seed that draws as few steps as there can be."""
     for seed in range(100):
         env.reset(seed=seed)
-        if skipped(env)[0] == 6 * 400:
+        if skipped(env)[0] == 6 * ROWS:
             return seed
     raise AssertionError
 
@@ -67,7 +69,7 @@ def test_numbers_of_steps_are_drawn_per_episode_evenly_and_by_its_seed() -> None
     env = make_walk_vector(num_envs=200, **DRAWN, scenario="ideal")
     env.reset(seed=0)
     drawn = skipped(env)
-    numbers, counts = np.unique(10 - drawn // 400, return_counts=True)
+    numbers, counts = np.unique(10 - drawn // ROWS, return_counts=True)
     assert numbers.tolist() == [4, 6, 8, 10]
     assert counts.min() > 30
     env.reset()
@@ -78,7 +80,7 @@ def test_numbers_of_steps_are_drawn_per_episode_evenly_and_by_its_seed() -> None
     for seed in (3, 5):
         scalar.reset(seed=seed)
         assert skipped(scalar)[0] == drawn[seed]
-    assert env.unwrapped.task.fewest_control_steps == 500 + 4 * 400
+    assert env.unwrapped.task.fewest_control_steps == 500 + 4 * ROWS
 
 
 def test_the_robot_does_not_depend_on_whether_the_number_of_steps_is_drawn() -> None:

@@ -34,6 +34,11 @@ CASES: dict[str, dict[str, Any]] = {
     },
     "open": {"com_feedback": False, "gravity": "ankle", "ramp_s": 0.3},
 }
+PLAYED = [
+    *("adaptive_quick", "weighing", "open"),
+    # those without options play in the test of bad numbers, by the header's own vectors
+    *(pytest.param(name, marks=pytest.mark.slow) for name in ("default", "adaptive")),
+]
 DRIVER = r"""
 #include "arm.h"
 #include <stddef.h>
@@ -65,12 +70,12 @@ int main(int count, char **paths) {
 """
 
 
-def walk(scenario: str = "nominal") -> Any:
+def walk(scenario: str = "nominal", num_steps: int = 4) -> Any:
     """A walk that turns and goes forward, so that no frame is another one."""
     return gymnasium.make(
         WALKER,
         step_period=[0.3, 0.4, 0.3],
-        num_steps=4,
+        num_steps=num_steps,
         gait={"step_length_m": 0.1, "turn_rad": 0.1},
         scenario=scenario,
     )
@@ -115,18 +120,18 @@ def compare(policy: Any, steps: PlayedSteps, compiler: str, folder: Path) -> Non
 
 
 @pytest.mark.parametrize("compiler", COMPILERS)
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("case", PLAYED)
 def test_the_header_computes_what_python_does(case: str, compiler: str, tmp_path: Path) -> None:
     """Catches a wrong frame, foot, gain, filter or row of the plan, and a load on the wrong leg."""
     policy = walker(**CASES[case])
-    compare(policy, play_steps(policy, 200, seed=1), compiler, tmp_path)
+    compare(policy, play_steps(policy, 100, seed=1), compiler, tmp_path)
 
 
 @pytest.mark.parametrize("compiler", COMPILERS)
 def test_adaptive_posture_in_c_walks_as_python_does(compiler: str, tmp_path: Path) -> None:
     """Catches an estimate at another time, a trim before the walk, and a leg that does not keep
     its pitch: on legs that are softer than assumed, measured as the robot measures."""
-    env = walk("soft")
+    env = walk("soft", num_steps=2)
     policy = baselines.make("adaptive_posture", env, posture={"trim": 4.0})
     observation, _ = env.reset(seed=3)
     rows = []
@@ -184,10 +189,15 @@ def test_bad_numbers_and_soft_springs_change_nothing(name: str, tmp_path: Path) 
             if (arm_step(&state, &shown, &plan, offset) != ARM_NO_EQUILIBRIUM) return 4;
             return !(state.steps == 0 && offset[0] == 7.0 && arm_test() < 1e-12);
         }"""
-    subprocess.run([compiled(tmp_path, c_walker(policy, "arm"), "gcc", program)], check=True)
+    header = c_walker(policy, "arm")
+    subprocess.run([compiled(tmp_path, header, "gcc", program, "-std=c99 -O0")], check=True)
 
 
-@pytest.mark.parametrize("policy", ["input_output", "adaptive_posture"])
+BOTH = [pytest.param("input_output", marks=pytest.mark.slow), "adaptive_posture"]
+"""The second one has all functions of the first one."""
+
+
+@pytest.mark.parametrize("policy", BOTH)
 def test_it_needs_no_heap(policy: str, tmp_path: Path) -> None:
     function = """int all(arm_state *state, arm_shown *shown, arm_plan *plan, double *offset) {
         arm_begin(state);
@@ -196,7 +206,7 @@ def test_it_needs_no_heap(policy: str, tmp_path: Path) -> None:
     require_no_library(tmp_path, c_walker(walker(policy), "arm"), function)
 
 
-@pytest.mark.parametrize("policy", ["input_output", "adaptive_posture"])
+@pytest.mark.parametrize("policy", BOTH)
 @pytest.mark.parametrize("compiler", COMPILERS)
 def test_the_command_writes_it(
     policy: str,

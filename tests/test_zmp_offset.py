@@ -102,7 +102,7 @@ def test_on_a_slope_the_mean_error_of_the_zmp_goes() -> None:
         state = None
         start = np.ones(2, dtype=np.bool_)
         deviations = []
-        for _ in range(1500):
+        for _ in range(1200):
             action, state = policy.predict(observation, state, start)
             observation, *_, info = env.step(action)
             start = np.zeros(2, dtype=np.bool_)
