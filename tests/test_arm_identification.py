@@ -18,7 +18,7 @@ import gymnasium
 import mujoco
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from rich.console import Console
 from scipy.optimize import root
@@ -41,10 +41,11 @@ from elastic_env.core.yaml_text import parse_yaml
 from elastic_env.joint.elasticity import ElasticJoint
 from elastic_env.joint.joint_names import JointAddresses
 from elastic_env.joint.make_elastic import make_elastic
+from train.commands.arm_problem import ArmProblem
 from train.commands.cli import main
 from train.commands.held_out import judge_poses
 from train.commands.identify_arm_tables import result_table
-from train.commands.identify_options import HoldoutOptions
+from train.commands.identify_options import ArmOptions, HoldoutOptions
 from train.figures.identification_plots import deflections
 
 FOLDER = Path(__file__).parents[1] / "docs" / "identification"
@@ -376,7 +377,7 @@ def test_planned_poses_tell_more_than_random_ones_and_are_free() -> None:
     assert set(np.unique(plan.direction)) == {-1.0, 1.0}
 
 
-@pytest.mark.parametrize("kind", ["end_effector", "imu"])
+@pytest.mark.parametrize("kind", ["end_effector", pytest.param("imu", marks=pytest.mark.slow)])
 def test_plan_says_in_advance_what_its_poses_then_tell(kind: Kind) -> None:
     """Catches an information in other units, or one that leaves the log out."""
     log = log_of(kind, 12)
@@ -478,7 +479,7 @@ def test_a_stiffness_that_no_reader_takes_is_not_assumed(
 def test_a_joint_of_which_the_poses_say_nothing_is_rigid_for_every_reader() -> None:
     """Catches a stiff joint that is written as soft as another one, and a file that one of its
     readers refuses."""
-    run("--log", str(EXAMPLE), "--output", "found")
+    run("--log", str(EXAMPLE), "--holdout", "0", "--output", "found")
     stiffness = parse_yaml(Path("found/joints.yaml").read_text())
     assert stiffness["base_yaw"] == {"stiffness": math.inf}
     of_base = json.loads(Path("found/identification.json").read_text())["joints"][0]
@@ -501,7 +502,8 @@ def test_a_joint_of_which_the_poses_say_nothing_is_rigid_for_every_reader() -> N
 def test_joints_that_are_not_sought_stand_in_the_file_as_rigid() -> None:
     """Catches a file that the compensator refuses, since it lacks joints that the docs call
     rigid."""
-    run("--log", str(EXAMPLE), "--joints", "elbow", "wrist_*", "--output", "found")
+    joints = ["--joints", "elbow", "wrist_*"]
+    run("--log", str(EXAMPLE), *joints, "--holdout", "0", "--output", "found")
     stiffness = parse_yaml(Path("found/joints.yaml").read_text())
     assert set(stiffness) == set(JOINTS)
     assert stiffness["shoulder_pitch"] == {"stiffness": math.inf}
@@ -663,6 +665,7 @@ def test_offsets_that_the_poses_do_not_tell_are_not_shown(
     assert of_base.split() == ["base_yaw", "–", "–", ">", "100", "%", "–"]
 
 
+@settings(max_examples=25)
 @given(
     names=st.lists(
         st.text("01no.~e\"'#: -[]{}é", min_size=1, max_size=6), min_size=7, max_size=7, unique=True
@@ -841,6 +844,15 @@ def test_bad_log_is_one_sentence_that_says_what_to_do(
     assert [word for word in words if word not in said] == []
     assert "Traceback" not in said
     assert not Path("runs").exists()
+
+
+def test_a_joint_without_a_column_is_named() -> None:
+    """Catches a forgotten column, which looks like a log that tells no stiffness."""
+    with Path("miss.csv").open("w", newline="") as file:
+        csv.writer(file).writerows(kept("theta.upper_roll"))
+    options = ArmOptions(log=["miss.csv"], end_effector="marker")
+    with pytest.warns(UserWarning, match=r"theta\.JOINT are held: upper_roll at 0 rad$"):
+        ArmProblem.from_options(options, ARM, Console(), 0)
 
 
 def test_degrees_are_named_where_a_joint_has_no_range(capsys: pytest.CaptureFixture[str]) -> None:

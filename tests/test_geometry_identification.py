@@ -168,7 +168,7 @@ def test_a_joint_that_gravity_almost_overcomes_still_rests(geometry: GeometryMod
         return float(softness * geometry.moments(rests)[0, 1, 2])
 
     rests, tips = 1e-3, 10.0
-    while tips - rests > 1e-6 * rests:
+    while tips - rests > 1e-4 * rests:
         softness = 0.5 * (rests + tips)
         try:
             turn(softness)
@@ -248,7 +248,7 @@ def made_up(
 def test_intervals_hold_the_truth(geometry: GeometryModel, options: dict[str, object]) -> None:
     """Of 95 % in at least 90 %: catches a wrong covariance, and a noise that is not estimated."""
     held = []
-    for seed in range(6):
+    for seed in range(4):
         problem, truth = made_up(geometry, seed, count=30, noise_m=5e-4, **options)
         fit = fit_geometry(problem)
         assert fit.noise_m == pytest.approx(5e-4, rel=0.25)
@@ -377,7 +377,7 @@ def test_the_command_identifies_and_its_files_hold(
     geometry: GeometryModel, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """From a log of two markers to a model that is better at unused poses."""
-    problem, _ = made_up(geometry, 7, count=60, noise_m=3e-4, geometry="dh")
+    problem, _ = made_up(geometry, 7, count=36, noise_m=3e-4, geometry="dh")
     model = tmp_path / "arm.xml"
     model.write_text(ARM)
     log = log_of(tmp_path, problem)
@@ -481,7 +481,7 @@ def test_joints_that_are_not_in_the_log_stand_where_the_keyframe_has_them() -> N
 
 def test_folds_hold_out_each_pose_once(geometry: GeometryModel) -> None:
     """Catches a pose that is fitted and judged, and a curve over other poses."""
-    problem, _ = made_up(geometry, 8, count=40, noise_m=5e-4)
+    problem, _ = made_up(geometry, 8, count=40, noise_m=5e-4, geometry="offsets")
     parts = split(40, share=0.3, folds=4, seed=0)
     assert sorted(np.concatenate(parts)) == list(range(40))
     held_out = judge(HoldoutProblem.from_geometry(problem), parts, 0, lambda done: None)

@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from elastic_env.hardware.buses.bus import TEMPERATURE_CYCLES
-from elastic_env.hardware.emulator.launch import Faults, RunningEmulator
+from elastic_env.hardware.emulator.launch import EmulatorConfig, Faults, RunningEmulator
+from elastic_env.hardware.emulator.virtual import VirtualBus
 from elastic_env.hardware.errors import BusGoneError, FaultError, HardwareError
 from elastic_env.hardware.live import plant
 from elastic_env.hardware.safety import supervised_bus
@@ -70,6 +71,7 @@ SERVO = [
     Case({"same_id": True}, stops="no usable reply"),
     Case({"unplugged": True}, stops="is gone"),
 ]
+IN_PROCESSES = {"unheard=1.0", "corrupted=0.1", "hot=True", "unplugged=True"}
 IMU = [
     Case({"imu_silent": True}, stops=r"has sent no attitude for \d+ ms"),
     Case({"imu_late_s": 0.02}, goes_on="attitudes are younger than imu_oldest_s"),
@@ -118,9 +120,54 @@ def cycles(bus: SupervisedBus, number: int) -> None:
 
 
 @pytest.mark.parametrize("case", SERVO, ids=named)
+def test_no_fault_of_a_servo_is_silent(case: Case) -> None:
+    """Catches a fault after which the motion goes on for no reason, or stops without torque off
+    or its cause: driver and supervisor in virtual time."""
+    bus = VirtualBus(EmulatorConfig())
+    bus.enable(PATIENT, np.array([[-1.0, 1.0]]))
+
+    def move(number: int) -> None:
+        for _ in range(number):
+            bus.exchange(np.zeros(1), bus.now_s + PERIOD_S)
+
+    move(5)
+    bus.emulator.events.clear()
+    bus.emulator.set_faults(case.faults)
+    if case.goes_on:
+        move(STOP_CYCLES)
+        assert bus.emulator.state["torque_on"] == [True]
+        return
+    with pytest.raises(HardwareError, match=case.stops.replace(" at .*", ".*")) as caught:
+        move(STOP_CYCLES)
+    events = [(name, value) for _, _, name, value in bus.emulator.events]
+    require_told_and_off(case, caught.value, events)
+
+
+def require_told_and_off(case: Case, error: Exception, events: list[tuple[str, int]]) -> None:
+    """Check that torque is off, or that the error says that nobody knows."""
+    if "unplugged" in case.faults:
+        assert isinstance(error, BusGoneError)
+        assert "Switch their power off" in str(error)  # nobody can switch it off over the bus
+    elif "unheard" in case.faults:
+        assert "not confirmed by servo 1" in str(error)
+    else:
+        # an overloaded servo lets go by itself, and gets commands until a reply reports it
+        offs = [number for number, event in enumerate(events) if event == LET_GO]
+        off_by_the_bus = offs[1] if "overload" in case.faults else offs[0]
+        assert "goal_position" not in [name for name, _ in events[off_by_the_bus:]]
+
+
+@pytest.mark.parametrize(
+    "case",
+    [
+        case if named(case) in IN_PROCESSES else pytest.param(case, marks=pytest.mark.slow)
+        for case in SERVO
+    ],
+    ids=named,
+)
 def test_no_fault_of_the_bus_is_silent(emulator: RunningEmulator, case: Case) -> None:
     """Catches a fault after which the motion goes on for no reason, or stops without torque off
-    or its cause."""
+    or its cause: driver and supervisor in a process of their own."""
     with SupervisedBus({emulator.port: [1]}) as bus:
         bus.enable(PATIENT)
         cycles(bus, 5)
@@ -132,21 +179,13 @@ def test_no_fault_of_the_bus_is_silent(emulator: RunningEmulator, case: Case) ->
             return
         with pytest.raises(HardwareError, match=case.stops) as caught:
             cycles(bus, STOP_CYCLES)
-        off = [(name, value) for _, _, name, value in emulator.events()]
+        events = [(name, value) for _, _, name, value in emulator.events()]
         emulator.faults(**Faults().model_dump())
-        if isinstance(caught.value, BusGoneError):
-            assert "Switch their power off" in str(
-                caught.value
-            )  # nobody can switch it off over the bus
+        require_told_and_off(case, caught.value, events)
+        if "unplugged" in case.faults:
             bus._is_enabled = False
         elif "unheard" in case.faults:
-            assert "not confirmed by servo 1" in str(caught.value)
             bus.disable()
-        else:
-            # an overloaded servo lets go by itself, and gets commands until a reply reports it
-            offs = [number for number, event in enumerate(off) if event == LET_GO]
-            off_by_the_bus = offs[1] if "overload" in case.faults else offs[0]
-            assert "goal_position" not in [name for name, _ in off[off_by_the_bus:]]
 
 
 @pytest.mark.parametrize(
@@ -253,7 +292,14 @@ def test_a_servo_that_never_tells_its_temperature_stops_the_motion() -> None:
     assert "no temperature from it in 60 cycles" in said[60]
 
 
-@pytest.mark.parametrize(("hang_s", "said_ms"), [(0.05, 50), (0.09, 90), (0.001, 20)])
+@pytest.mark.parametrize(
+    ("hang_s", "said_ms"),
+    [
+        (0.05, 50),
+        pytest.param(0.09, 90, marks=pytest.mark.slow),
+        pytest.param(0.001, 20, marks=pytest.mark.slow),
+    ],
+)
 def test_a_supervisor_in_motion_may_be_silent_for_as_long_as_the_program(
     emulator: RunningEmulator, hang_s: float, said_ms: int
 ) -> None:
@@ -272,16 +318,15 @@ def test_a_supervisor_in_motion_may_be_silent_for_as_long_as_the_program(
     assert emulator.state()["torque_on"] == [False]
 
 
-@pytest.mark.parametrize("hang_s", [0.05, 0.09, 0.005])
-def test_the_limit_on_silence_is_the_one_that_was_given(
-    emulator: RunningEmulator, hang_s: float
-) -> None:
-    """Catches a limit that `enable` does not pass on."""
+def test_the_limit_on_silence_is_the_one_that_was_given(emulator: RunningEmulator) -> None:
+    """Catches a limit that `enable` does not pass on, or does not pass on the second time."""
     with SupervisedBus({emulator.port: [1]}) as bus:
         assert bus._answer_s == supervised_bus._ANSWER_S
-        bus.enable(SafetyLimits(hang_s=hang_s))
-        assert bus._answer_s == max(hang_s, 0.02)
-        assert ("--patient" in bus._hint) == (hang_s < 0.09)
+        for hang_s in (0.05, 0.09, 0.005):
+            bus.enable(SafetyLimits(hang_s=hang_s))
+            assert bus._answer_s == max(hang_s, 0.02)
+            assert ("--patient" in bus._hint) == (hang_s < 0.09)
+            bus.disable()
 
 
 def test_the_watchdog_is_set_where_there_is_one() -> None:

@@ -9,6 +9,7 @@ import sys
 import time
 import tty
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,7 +18,10 @@ from elastic_env.core.errors import ConfigurationError
 from elastic_env.hardware.buses.bus import States
 from elastic_env.hardware.buses.dynamixel_bus import DynamixelBus
 from elastic_env.hardware.buses.port import Port
+from elastic_env.hardware.buses.servo_models import servo_model
 from elastic_env.hardware.emulator.launch import EmulatorConfig, RunningEmulator
+from elastic_env.hardware.emulator.servos import EmulatedServo
+from elastic_env.hardware.emulator.virtual import VirtualBus
 from elastic_env.hardware.errors import (
     BusGoneError,
     FaultError,
@@ -32,6 +36,7 @@ from elastic_env.hardware.safety.supervised_bus import SupervisedBus
 from elastic_env.hardware.settings import SafetyLimits
 from tests.busy import once_more
 from tests.emulators import stopped, wait_until_free, wait_until_rest
+from tests.lines import looped
 
 PERIOD_S = 0.004
 PATIENT = SafetyLimits(patience_cycles=10, hang_s=0.09)
@@ -216,21 +221,19 @@ def test_check_finds_nothing_wrong_with_good_servos(emulator: RunningEmulator) -
 def test_check_finds_nothing_wrong_with_the_newer_servos() -> None:
     """Catches emulated servos that are delivered with settings that nothing but the maker's
     program can change."""
-    with (
-        RunningEmulator(EmulatorConfig(model_number=2020)) as newer,
-        DynamixelBus(newer.port) as bus,
-    ):
-        found = {one.name: one.is_good for one in check_bus(bus, [1]) if one.name.startswith("1: ")}
+    newer = VirtualBus(EmulatorConfig(model_number=2020)).driver
+    found = {one.name: one.is_good for one in check_bus(newer, [1]) if one.name.startswith("1: ")}
     assert set(found.values()) == {True}
 
 
 @pytest.mark.parametrize("fault", ["lost", "corrupted"])
 def test_a_bad_line_is_seen_by_its_lost_and_damaged_replies(fault: str) -> None:
     """Catches a check that calls a line fine whose replies come at the second try."""
-    with RunningEmulator(EmulatorConfig(seed=5)) as emulator, DynamixelBus(emulator.port) as bus:
-        bus.attach([1])
-        emulator.faults(**{fault: 0.1})  # from here on the same replies every time
-        found = {one.name: one for one in check_bus(bus, [1])}
+    bus = VirtualBus(EmulatorConfig(seed=5))
+    assert {one.name: one for one in check_bus(bus.driver, [1])}["lost replies"].is_good
+    bus.emulator.set_faults({fault: 0.1})
+    found = {one.name: one for one in check_bus(bus.driver, [1])}
+    assert not found["lost replies"].is_good
     assert "cable" in found["lost replies"].cure
     assert not found["lost replies"].is_vital
 
@@ -299,22 +302,16 @@ def test_late_replies_are_not_taken_for_the_next_ones(emulator: RunningEmulator)
 def test_second_program_is_told_which_port_is_taken(
     emulator: RunningEmulator, supervised: SupervisedBus
 ) -> None:
-    """Catches two programs on one bus, one directly and one through a supervisor."""
+    """Catches two programs on one bus, one directly and one through a supervisor; and a port that
+    is opened for an IMU, and its input thrown away, before anybody has asked whether it is free."""
     for intrude in (
         lambda: DynamixelBus(emulator.port).open(),
         lambda: SupervisedBus({emulator.port: [1]}),
     ):
         with pytest.raises(PortError, match=emulator.port):
             intrude()
-    assert len(supervised.enable(PATIENT)) == 2
-
-
-def test_a_program_that_takes_the_port_for_an_imus_does_not_disturb_the_motion(
-    emulator: RunningEmulator, supervised: SupervisedBus
-) -> None:
-    """Catches a port that is opened, and its input thrown away, before anybody has asked whether
-    it is free."""
     start = supervised.enable(PATIENT)
+    assert len(start) == 2
     cycle(supervised, start.tolist(), 5)
     for _ in range(5):
         with pytest.raises(PortError, match=f"another program uses {emulator.port}"):
@@ -413,7 +410,10 @@ def test_ids_that_cannot_be_are_refused_before_anything_starts() -> None:
         SupervisedBus({"/dev/ttyNOTHING": [1, 1]})
 
 
-@pytest.mark.parametrize("how", ["kill", "stop", "interrupt", "kill-supervisor"])
+@pytest.mark.parametrize(
+    "how",
+    ["kill", pytest.param("stop", marks=pytest.mark.slow), "interrupt", "kill-supervisor"],
+)
 def test_torque_goes_off_whatever_ends_the_program(emulator: RunningEmulator, how: str) -> None:
     """Catches every way of leaving a servo under torque: death, hang, Ctrl-C, and the death of
     the supervisor."""
@@ -463,13 +463,17 @@ def test_two_buses_are_read_side_by_side(emulator: RunningEmulator) -> None:
 
 def test_wrong_model_number_is_refused_before_anything_is_written() -> None:
     """Catches registers of one model written to another."""
-    with RunningEmulator(EmulatorConfig(registers={"model_number": 1021})) as strange:
-        with (
-            DynamixelBus(strange.port) as bus,
-            pytest.raises(HardwareError, match="no control table for model number 1021"),
-        ):
-            bus.attach([1])
-        assert strange.events() == []
+    events: list[tuple[int, str, int]] = []
+
+    def note(*event: Any) -> None:
+        events.append(event)
+
+    model = servo_model(54024)
+    with pytest.raises(HardwareError, match="no control table for model number 1021"):
+        looped([EmulatedServo(1, model, note, registers={"model_number": 1021})])
+    assert events == []
+    looped([EmulatedServo(1, model, note)]).write_torque(1, True)
+    assert events
 
 
 def test_no_port_says_what_there_is() -> None:

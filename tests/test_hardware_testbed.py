@@ -117,7 +117,7 @@ def test_hardware_has_the_spaces_the_keys_and_the_motion_of_the_simulation(
 
 def test_without_an_imu_the_link_is_unknown(emulator: RunningEmulator) -> None:
     """Catches an encoder that is passed off as the link's angle, and a torque that is passed off
-    as measured."""
+    as measured; and a port that is opened for a step outside an episode."""
     env = make_hardware(emulator)
     env.reset()
     _, reward, _, _, info = env.step(np.zeros(1, dtype=np.float32))
@@ -129,13 +129,6 @@ def test_without_an_imu_the_link_is_unknown(emulator: RunningEmulator) -> None:
         env.unwrapped.truth()
     env.close()
     assert emulator.state()["torque_on"] == [False]
-
-
-def test_a_step_outside_an_episode_says_so_and_touches_nothing(emulator: RunningEmulator) -> None:
-    """Catches a port that is opened for it, and advice that nobody can follow from Python."""
-    env = make_hardware(emulator)
-    env.reset()
-    env.close()
     emulator.events()
     with pytest.raises(
         HardwareError, match=rf"no episode is under way at {emulator.port}.* reset\(\)"

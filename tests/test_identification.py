@@ -24,6 +24,14 @@ from train.evaluate.conditions import Condition, PolicySpec
 from train.evaluate.episodes import Evaluation, evaluate
 
 ID = "elastic_env/Testbed-v0"
+
+
+@pytest.fixture(autouse=True)
+def few_resamples(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A tenth of the usual ones: enough for an interval."""
+    monkeypatch.setattr(identification, "_RESAMPLES", 99)
+
+
 G = 60.0  # torque of the pendulum at the horizontal [N·m]
 SHARES = (-52.5 / G, 34.6 / G)  # the paper's range of torque
 REST = pytest.approx
@@ -166,10 +174,9 @@ def test_plain_line_is_biased_by_the_dead_band_by_the_derived_amount() -> None:
 
 
 @pytest.mark.slow
-def test_interval_covers_the_truth_as_often_as_it_says(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_interval_covers_the_truth_as_often_as_it_says() -> None:
     """Catches an interval that resamples visits, whose noise is shared within a position, or
     that is half as wide."""
-    monkeypatch.setattr(identification, "_RESAMPLES", 99)
     generator = np.random.default_rng(1)
     hits = 0
     widths = []
@@ -318,7 +325,13 @@ NARROW = {
 }
 CALM = H54_200_S500_R.replace(damping=60.0)
 """Comes to rest sooner."""
-WIDE = {"kind": "hold", "positions": 7, "rate": 0.1, "settle_s": 1.0, "measure_s": 0.4}
+WIDE = {
+    "kind": "hold",
+    "positions": 6,
+    "rate": 0.12,
+    "settle_s": 0.7,
+    "measure_s": 0.2,
+}
 # compensated, the error is the same all over
 ENDS = {**WIDE, "positions": 2, "lower": -0.4, "upper": 0.4, "rate": 0.3, "settle_s": 0.8}
 RUNS: dict[str, dict[str, Any]] = {
@@ -340,7 +353,7 @@ RUNS: dict[str, dict[str, Any]] = {
         "reference": {**NARROW, "positions": 2},
         "scenario": "ideal",
         "policy": "input",
-        "env_options": {"joint": CALM},
+        "env_options": {"stiffness": 300.0, "joint": CALM},
     },
 }
 
@@ -372,7 +385,14 @@ def range_at_rest(run: Evaluation) -> tuple[float, float]:
     return float(error.min()), float(error.max())
 
 
-@pytest.mark.parametrize("K", [300.0, 1001.0, 3000.0])
+@pytest.mark.parametrize(
+    "K",
+    [
+        300.0,
+        pytest.param(1001.0, marks=pytest.mark.slow),
+        pytest.param(3000.0, marks=pytest.mark.slow),
+    ],
+)
 def test_ideal_testbed_gives_its_stiffness(K: float, runs: dict[str, Evaluation]) -> None:
     """Catches a plant whose spring is not the one it is told, and friction or play that an ideal
     one does not have."""
@@ -387,7 +407,7 @@ def test_ideal_link_is_where_it_should_be_at_rest(runs: dict[str, Evaluation]) -
     """Catches input compensation with a residue: Fig. 6 in `ideal` stays below 0.2 mrad in every
     sample at rest."""
     assert runs["ideal input"].values("link_error_peak_rad")[0] < 2e-4
-    assert runs["ideal 1001"].values("link_error_peak_rad")[0] > 0.03
+    assert runs["ideal 300"].values("link_error_peak_rad")[0] > 0.1
 
 
 def test_nominal_testbed_gives_stiffness_and_friction(runs: dict[str, Evaluation]) -> None:

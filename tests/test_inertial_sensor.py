@@ -195,7 +195,7 @@ def test_the_error_at_rest_is_that_of_the_data_sheet() -> None:
 def test_the_error_in_a_walk_is_within_that_of_the_data_sheet() -> None:
     """±0.25° at rest, ±0.5° in motion: catches a filter that the walk throws off, and one that
     is not disturbed."""
-    shown, true, env = shown_and_true(16, 500, scenario="imu", **SHORT)
+    shown, true, env = shown_and_true(8, 500, scenario="imu", **SHORT)
     walking = env.unwrapped.task.plan.timing.walking[:501]
     # as old as the measurements are, against the truth of then
     error = (shown[1:] - true[:-1])[walking[:-1]]
@@ -425,7 +425,7 @@ def test_the_links_error_at_rest_is_that_of_the_data_sheet_and_stays() -> None:
     assert np.sqrt(np.square(error).mean()) == pytest.approx(
         math.radians(0.25), rel=5 / math.sqrt(2 * 256)
     )
-    for _ in range(100):
+    for _ in range(25):
         observation, _, _, _, info = env.step(np.zeros((256, 1), np.float32))
     np.testing.assert_allclose(observation[:, 6] - info["link_angle"], error, rtol=0.0, atol=1e-6)
 

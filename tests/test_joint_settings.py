@@ -29,7 +29,7 @@ ARM = f"""<mujoco><compiler angle="radian"/><worldbody>
       <body name="r" pos="-0.03 0 0.3"><joint name="gr" type="slide" axis="1 0 0" range="0 0.1"/>
         <geom type="box" size="0.01 0.01 0.03" pos="0 0 0.03" mass="0.05"/></body>
     </body></body></worldbody></mujoco>"""
-POSES = {"kind": "poses", "positions": 2}
+POSES = {"kind": "poses", "positions": 1}
 TWO = ["j1", "j2"]
 
 

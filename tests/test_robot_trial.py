@@ -28,7 +28,7 @@ from train.evaluate.conditions import Condition
 from train.evaluate.environments import environment
 from train.evaluate.episodes import Evaluation, evaluate
 
-QUICK = Poses(positions=1, move_s=0.8, settle_s=0.6, measure_s=0.1)
+QUICK = Poses(positions=1, move_s=0.6, settle_s=0.5, measure_s=0.1)
 SEVERAL = Poses(positions=5)
 SINE = {"kind": "sine", "amplitude": 0.1, "duration_s": 0.5, "onset_s": 0.25}
 JOINTS = EXAMPLE.with_suffix(".yaml")

@@ -36,7 +36,8 @@ from elastic_env.core.yaml_text import parse_yaml
 from elastic_env.joint.joint_settings import read_joints
 from tests.servo_trials import SOUGHT, draw_servo, holds, make_logs
 from train.commands.cli import main
-from train.commands.identify_servo import fitted_logs, show_result, verdict
+from train.commands.identify_options import ServoOptions
+from train.commands.identify_servo import fitted_logs, known_load, show_result, verdict
 
 MASS_KG, LENGTH_M = 0.5, 0.1
 WEIGHT = MASS_KG * GRAVITY * LENGTH_M
@@ -266,6 +267,11 @@ def test_bad_json_is_refused_in_one_sentence(text: str, tmp_path: Path) -> None:
 def test_a_log_without_a_load_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigurationError, match="mass-kg"):
         read_servo_log(csv_of(tmp_path / "log.csv", **good()))
+
+
+def test_a_pendulum_in_grams_is_named() -> None:
+    with pytest.warns(UserWarning, match=r"480.5 N·m, .* gives 84 N·m; check --mass-kg"):
+        known_load(ServoOptions(mass_kg=490.0, lever_m=0.1), None, None)
 
 
 def test_parquet_without_its_package_says_what_to_install(tmp_path: Path) -> None:

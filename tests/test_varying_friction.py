@@ -63,7 +63,7 @@ def plant(joint: ElasticJoint, form: Form = "tendon", gravity: float = 0.0) -> m
 
 
 def turn(
-    model: mujoco.MjModel, speed: float, load: float, time_s: float = 2.0
+    model: mujoco.MjModel, speed: float, load: float, time_s: float = 1.2
 ) -> tuple[mujoco.MjData, SingleWorld]:
     """Drive a joint at a speed against a constant torque on its link [rad/s], [N·m]."""
     world = SingleWorld(model)
@@ -140,7 +140,7 @@ def test_friction_only_takes_energy(joint: ElasticJoint) -> None:
         world = SingleWorld(model)
         world.qpos[0] = [0.9, 0.9]
         energy: list[float] = []
-        for _ in range(3000):
+        for _ in range(2000):
             world.refresh(np.array([True]))
             energy.append(float(world._data.energy.sum()))
             world.advance(1)
@@ -158,7 +158,7 @@ def test_a_motor_under_load_reaches_the_speed_of_the_closed_form(form: Form, loa
     lost."""
     joint = STEADY.replace(servo=SERVO.replace(motor=MOTOR), viscous_friction=0.01)
     model = plant(joint, form)
-    data = turn(model, speed=1e3, load=load, time_s=3.0)[0]
+    data = turn(model, speed=1e3, load=load, time_s=1.8)[0]
     speed = 0.0
     for _ in range(60):  # viscous friction is a load of the gear, too
         passed = passed_torque(np.array(load + 0.01 * speed), 1.0, 0.05, 0.4)
