@@ -479,22 +479,22 @@ def test_a_stiffness_that_no_reader_takes_is_not_assumed(
 def test_a_joint_of_which_the_poses_say_nothing_is_rigid_for_every_reader() -> None:
     """Catches a stiff joint that is written as soft as another one, and a file that one of its
     readers refuses."""
-    run("--log", str(EXAMPLE), "--holdout", "0", "--output", "found")
-    stiffness = parse_yaml(Path("found/joints.yaml").read_text())
-    assert stiffness["base_yaw"] == {"stiffness": math.inf}
-    of_base = json.loads(Path("found/identification.json").read_text())["joints"][0]
+    fit = fit_arm(model_of(read_log(EXAMPLE, RANGES)))
+    described, joints = describe_fit(fit, 0.03, None).save(Path())[:2]
+    assert parse_yaml(joints.read_text())["base_yaw"] == {"stiffness": math.inf}
+    of_base = json.loads(described.read_text())["joints"][0]
     assert (of_base["source"], of_base["stiffness_nm_per_rad"], of_base["friction_nm"]) == (
         "rigid",
         None,
         None,
     )
-    compensator = PositionCompensator.from_model(FOLDER / "arm.xml", "found/joints.yaml")
+    compensator = PositionCompensator.from_model(FOLDER / "arm.xml", joints)
     q = np.full(7, 0.3)
     np.testing.assert_allclose(
         compensator.command(q) - q, [0.0, *(compensator.torque(q) / K)[1:]], rtol=0.12
     )
     env: Any = gymnasium.make(
-        "elastic_env/Robot-v0", model=str(FOLDER / "arm.xml"), joints="found/joints.yaml"
+        "elastic_env/Robot-v0", model=str(FOLDER / "arm.xml"), joints=str(joints)
     )
     assert env.action_space.shape == (6,)
 

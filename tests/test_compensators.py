@@ -1,6 +1,7 @@
 """The compensators against closed forms, MuJoCo's equilibrium, finite differences and the
 simulated plant."""
 
+import re
 from typing import Any
 
 import gymnasium
@@ -226,9 +227,8 @@ def test_stiff_and_soft_joints_together_are_not_singular() -> None:
 def test_wrong_number_of_stiffnesses_says_required_and_given(stiffness: list[float]) -> None:
     """Catches a stiffness that is broadcast over the joints, or cut, instead of refused."""
     env = gymnasium.make("elastic_env/Testbed-v0", reference="sine")
-    with pytest.raises(
-        ConfigurationError, match=rf"1 of them \[N·m/rad\].*joint.*got .*\({len(stiffness)},\)"
-    ):
+    got = re.escape(str(stiffness))
+    with pytest.raises(ConfigurationError, match=rf"a list of 1 \[N·m/rad\].*joint.*got {got}"):
         baselines.make("input", env, stiffness=stiffness)
 
 

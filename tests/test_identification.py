@@ -333,7 +333,15 @@ WIDE = {
     "measure_s": 0.2,
 }
 # compensated, the error is the same all over
-ENDS = {**WIDE, "positions": 2, "lower": -0.4, "upper": 0.4, "rate": 0.3, "settle_s": 0.8}
+ENDS = {
+    **WIDE,
+    "positions": 2,
+    "lower": -0.4,
+    "upper": 0.4,
+    "rate": 0.3,
+    "shortest_move_s": 2.5,
+    "settle_s": 0.8,
+}
 RUNS: dict[str, dict[str, Any]] = {
     "nominal": {"reference": WIDE, "scenario": "nominal"},
     "backlash": {"reference": WIDE, "scenario": "backlash"},
