@@ -48,12 +48,12 @@ class EpisodesByRobot:
             self._places.append((groups, row_of[groups], column_of))
 
     def figures(
-        self, values: "pd.Series[float]", statistic: Literal["mean", "sum", "count"] = "mean"
+        self, values: Any, statistic: Literal["mean", "sum", "count"] = "mean"
     ) -> list[Array]:
         """A statistic over the episodes of each robot, (seeds, robots) for every cell.
 
         Args:
-            values: A value for every row.
+            values: Series with a value for every row.
             statistic: nan without an episode; a mean also without a value.
         """
         figures = values.groupby(self._group_of).agg(statistic).to_numpy(dtype=np.float64)
