@@ -2,21 +2,18 @@
 
 import json
 import re
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
-from rich.console import Console
 
-import train.commands.bench
 from elastic_env.core.config import load_yaml
 from elastic_env.core.errors import ConfigurationError
 from train.commands.bench import BenchConfig, find_config
 from train.commands.cli import main
 from train.evaluate.conditions import Condition
-from train.evaluate.episodes import Evaluation, evaluate
+from train.evaluate.episodes import evaluate
 from train.runs.github_annotations import annotation
 
 ROOT = Path(__file__).parents[1]
@@ -25,13 +22,7 @@ QUICK = {"kind": "sine", "duration_s": 0.5, "onset_s": 0.5, "amplitude": 0.1}
 
 @pytest.fixture(autouse=True)
 def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Results of a test go to its own folder, and cells are played in this process: starting
-    others takes seconds."""
-
-    def run(conditions: Sequence[Condition], console: Console) -> list[Evaluation]:
-        return [evaluate(condition, num_threads=1) for condition in conditions]
-
-    monkeypatch.setattr(train.commands.bench, "run_conditions", run)
+    """Results of a test go to its own folder."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("GITHUB_STEP_SUMMARY", raising=False)
     monkeypatch.delenv("GITHUB_ACTIONS", raising=False)

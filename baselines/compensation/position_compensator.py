@@ -132,7 +132,8 @@ class PositionCompensator:
             model has position actuators, a warning names their k_p.
         limit_rad: Largest offset between command and desired angle [rad].
         ramp_s: Time within which offsets grow from zero after the start, and within which a
-            payload grows [s].
+            payload grows [s]. With dry friction, begin to move after it: friction holds a link
+            that has come to rest before.
         period_s: Time between two commands, for the ramp, and for the rate of desired angles
             without one [s].
         friction: True to compensate the dry friction in `stiffness`, False not to; None to do so

@@ -154,7 +154,7 @@ class _BatchRun:
         return self._outcomes
 
     def _play_in_workers(self) -> None:
-        watch = Watch(self._report, self._end_in_worker, self._print_move)
+        watch = Watch(self._report, self._end_of_worker, self._print_move)
         arguments = [(cells,) for cells in self._cells]
         with tempfile.TemporaryDirectory() as temporary:
             folder = Path(temporary) if self.store is None else self.store.folder.parent
@@ -168,8 +168,8 @@ class _BatchRun:
             self._tally.running.update(numbers)
         self._show(0, sum(self._played), self._tally.summary("cells"))
 
-    def _end_in_worker(self, batch: int, outcome: Outcome) -> None:
-        """Repeat the warnings of a worker here, where each is shown once."""
+    def _end_of_worker(self, batch: int, outcome: Outcome) -> None:
+        """Take the outcomes of a worker, and repeat its warnings here, where each is shown once."""
         if outcome.error is None:
             outcomes, texts = outcome.value
             for text in texts:

@@ -104,7 +104,9 @@ def _real_bus(setup: ArmSetup, console: Console) -> SupervisedBus:
 def _consent_question(setup: ArmSetup) -> str:
     """Question before the first motion: what will move, and whether it may."""
     options = setup.options
-    nudges = f"move each joint by ±{options.nudge_rad:g} rad, away from a stop, then "
+    nudges = (
+        f"move each joint by ±{options.nudge_rad:g} rad, away from a stop, then all together, then "
+    )
     return (
         f"The {len(setup.joints)} servos at {setup.settings.port} will"
         f" {nudges if options.check else ''}follow the targets with up to"

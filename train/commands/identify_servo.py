@@ -118,7 +118,7 @@ def known_load(options: ServoOptions, robot: str | None, joint: str | None) -> L
         if options.mass_kg is None or options.lever_m is None:
             return None
         load = Load.pendulum(options.mass_kg, options.lever_m)
-        _warn_of_heavy(load)
+        _warn_of_weight(load)
         return load
     if options.mass_kg is not None:
         raise ConfigurationError("give a pendulum by --mass-kg and --lever-m, or --robot, not both")
@@ -127,7 +127,7 @@ def known_load(options: ServoOptions, robot: str | None, joint: str | None) -> L
     return Load.from_model(compiled_model(robot), joint)
 
 
-def _warn_of_heavy(pendulum: Load) -> None:
+def _warn_of_weight(pendulum: Load) -> None:
     """Warn of a weight that no known servo holds, such as a mass in grams."""
     strongest = max(servo_models().values(), key=lambda servo: servo.largest_torque)
     if pendulum.torque > strongest.largest_torque:

@@ -134,12 +134,19 @@ class Arm:
 
         Args:
             ramp_s: Time in which the compensation grows [s].
-            way_rad: Distance, up or at the end of a range down; 0 to stay [rad].
+            way_rad: Distance, at the upper end of a range downwards; 0 to stay [rad].
+
+        Yields:
+            A state for each cycle.
+
+        Raises:
+            FaultError: The motion was stopped; the message says why.
         """
         for _ in range(round(ramp_s / self.period_s)):
             yield self.cycle(self.start)
-        is_below = self.start + way_rad <= self._highest
-        yield from self.go(np.where(is_below, self.start + way_rad, self.start - way_rad))
+        has_room = self.start + way_rad <= self._highest
+        away = np.where(has_room, self.start + way_rad, self.start - way_rad)
+        yield from self.go(np.maximum(away, self._lowest))
         yield from self.go(self.start)
 
     def cycle(self, target: Array) -> ArmState:
