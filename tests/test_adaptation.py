@@ -84,14 +84,13 @@ def test_the_mean_load_starts_at_the_assumed_one() -> None:
 class Fixed:
     """An estimator that says the same of every joint."""
 
+    measures_load = False
+
     def begin(self, num_worlds: int) -> Array:
         return np.zeros((num_worlds, 1))
 
-    def estimate(self, rows: Array, memory: Array) -> tuple[Array, Array]:
-        return np.full((len(rows), 12), 0.5), memory + 1.0
-
-    def load(self, memory: Array) -> None:
-        return None
+    def estimate(self, rows: Array, memory: Array) -> tuple[Array, None, Array]:
+        return np.full((len(rows), 12), 0.5), None, memory + 1.0
 
 
 class Recorded(Zero):

@@ -12,9 +12,9 @@ import pytest
 
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
-from elastic_env.joint.elasticity import ElasticJoint, Servo
-from elastic_env.joint.friction import passed_torque
-from elastic_env.joint.joint_names import motor_name, servo_name
+from elastic_env.joint.elasticity import ElasticJoint, Servo, joint_torque
+from elastic_env.joint.friction import dry_friction, passed_torque
+from elastic_env.joint.joint_names import JointAddresses, motor_name, servo_name
 from elastic_env.joint.make_elastic import Form, make_elastic, transform_hinges
 from elastic_env.joint.model_servo import position_servo
 from elastic_env.joint.motor import Motor, terminal_speed
@@ -295,3 +295,36 @@ def test_a_drawn_robot_has_its_own_varying_friction() -> None:
     friction = VaryingFriction(model)
     limits = friction.limits(many._field, many.bind)[:, 0]
     np.testing.assert_allclose(limits, [0.08, 0.04])
+
+
+@pytest.mark.parametrize("stribeck_speed", [0.2, 0.0])
+@pytest.mark.parametrize("form", ["tendon", "rigid"])
+def test_the_kernel_is_the_formulas(form: Form, stribeck_speed: float) -> None:
+    """Catches a term that the compiled friction has otherwise, in worlds with own parameters."""
+    model = plant(JOINT, form)
+    friction = VaryingFriction(model)
+    at = JointAddresses.of(model, ["q"])
+    generator = np.random.default_rng(4)
+    terms, spring = generator.uniform(0.02, 0.2, (2, 4, 40))
+    terms[3] = stribeck_speed
+    state = {
+        name: generator.normal(scale=0.2, size=(40, model.nv))
+        for name in ("qpos", "qvel", "qacc", "qfrc_actuator")
+    }
+    state["qvel"][::4] = 0.0
+    field = {
+        "numeric_data": terms.T,
+        "tendon_stiffness": spring[:1].T,
+        "tendon_damping": spring[1:2].T,
+        "tendon_lengthspring": spring[2:].T[:, None] * [-1.0, 1.0],
+        "dof_armature": model.dof_armature[None],
+    }
+    if form == "tendon":
+        deflection = state["qpos"][:, at.theta[0]] - state["qpos"][:, at.q[0]]
+        rate = state["qvel"][:, at.theta_dot[0]] - state["qvel"][:, at.q_dot[0]]
+        load = joint_torque(deflection, rate, spring[0], spring[1], spring[2] + spring[3])
+    else:
+        load = (state["qfrc_actuator"] - model.dof_armature * state["qacc"])[:, 0]
+    expected = dry_friction(state["qvel"][:, friction.links[0]], load, *terms)
+    limits = friction.limits(field.__getitem__, state.__getitem__)
+    np.testing.assert_allclose(limits[:, 0], expected, rtol=1e-14)

@@ -94,19 +94,27 @@ ASSUMED_LOADS = 5.0
 
 
 class Estimator(Protocol):
-    """Estimates r from observations; its memory is an array or a named tuple, one row per world."""
+    """Estimates r from observations; its memory is an array or a named tuple, one row per world.
+
+    Attributes:
+        measures_load: True if r contains an excess load.
+    """
+
+    measures_load = False
 
     @abstractmethod
     def begin(self, num_worlds: int) -> Any:
         """Memory before the first estimate."""
 
     @abstractmethod
-    def estimate(self, rows: Array, memory: Any) -> tuple[Array, Any]:
-        """Correction r of every joint, (num_worlds, n) [1], and the new memory."""
+    def estimate(self, rows: Array, memory: Any) -> tuple[Array, Array | None, Any]:
+        """Correction r of every joint, the excess load within it, and the new memory.
 
-    def load(self, memory: Any) -> Array | None:
-        """Mean excess load μ within r, (num_worlds, 1) [1]; None for none."""
-        return _mean(memory.loads) if isinstance(memory, EstimatorMemory) else None
+        Returns:
+            r, (num_worlds, n) [1].
+            Mean excess load μ, (num_worlds, 1) [1]; None for none.
+            Memory.
+        """
 
 
 class EstimatorMemory(NamedTuple):
@@ -128,6 +136,8 @@ class LegEstimator(Estimator):
         sensors: Joint torque sensors, if it has them.
     """
 
+    measures_load = True
+
     def __init__(self, model: WalkerModel, sensors: DeflectionSensors | None = None) -> None:
         self.observer = BendingObserver(model)
         self.sensors = sensors
@@ -146,11 +156,11 @@ class LegEstimator(Estimator):
         return values, load, EstimatorMemory(loads, observer)
 
     @override
-    def estimate(self, rows: Array, memory: EstimatorMemory) -> tuple[Array, Any]:
+    def estimate(self, rows: Array, memory: EstimatorMemory) -> tuple[Array, Array, Any]:
         values, load, memory = self.observe(rows, memory)
         error = values[:, _ERROR].reshape(len(rows), 2, 2)[:, :, self._axis]
         joints = ((1.0 + error) * (1.0 + load[:, :, None]) - 1.0) * _CORRECTED
-        return joints.reshape(len(rows), -1), memory
+        return joints.reshape(len(rows), -1), load, memory
 
 
 class RegressionMemory(NamedTuple):
@@ -195,7 +205,7 @@ class EncoderEstimator(Estimator):
         return RegressionMemory(zero, zero, np.stack([zero] * 5, axis=1))
 
     @override
-    def estimate(self, rows: Array, memory: Any) -> tuple[Array, Any]:
+    def estimate(self, rows: Array, memory: Any) -> tuple[Array, Array | None, Any]:
         deflection = self._sensors.deflection(rows)
         q = self._view.theta(rows) - deflection
         displacement = np.where(memory.sums[:, 0] > 0.0, q - memory.q, 0.0)
@@ -205,7 +215,8 @@ class EncoderEstimator(Estimator):
         y = deflection - h
         terms = np.stack([np.ones_like(h), h, h * h, y, h * y], axis=1)
         sums = memory.sums + self._sensors.has * terms
-        return regress(sums.swapaxes(0, 1), self.prior), RegressionMemory(friction, q, sums)
+        r = regress(sums.swapaxes(0, 1), self.prior)
+        return r, None, RegressionMemory(friction, q, sums)
 
     def _expected_deflection(self, rows: Array, q: Array, friction: Array) -> Array:
         """Deflection h under the torque of the motion and under friction, (num_worlds, n) [rad]."""
@@ -219,6 +230,7 @@ class LegEncoderEstimator(EncoderEstimator):
     """r of a walker's joints; for joints without a link encoder by the load only."""
 
     prior = StiffnessPrior()
+    measures_load = True
 
     @override
     def _make_torque_model(self, model: Any) -> Any:
@@ -231,13 +243,13 @@ class LegEncoderEstimator(EncoderEstimator):
         return EstimatorMemory(np.zeros((num_worlds, 2)), super().begin(num_worlds))
 
     @override
-    def estimate(self, rows: Array, memory: EstimatorMemory) -> tuple[Array, Any]:
-        error, observer = super().estimate(rows, memory.observer)
+    def estimate(self, rows: Array, memory: EstimatorMemory) -> tuple[Array, Array, Any]:
+        error, _, observer = super().estimate(rows, memory.observer)
         force = rows[:, self._wrench].reshape(len(rows), 2, 2, 3)[:, :, 0, 2]
         excess = force.sum(axis=1, keepdims=True) / self._carried - 1.0
         load, loads = mean_load(memory.loads, excess)
         r = (1.0 + self._sensors.has * error) * (1.0 + load) - 1.0
-        return r, EstimatorMemory(loads, observer)
+        return r, load, EstimatorMemory(loads, observer)
 
     @override
     def _expected_deflection(self, rows: Array, q: Array, friction: Array) -> Array:
@@ -263,9 +275,4 @@ def mean_load(memory: Array, excess: Array) -> tuple[Array, Array]:
         excess: Measured over assumed load less one, (num_worlds, 1) [1].
     """
     memory = memory + np.hstack([np.ones_like(excess), excess])
-    return _mean(memory), memory
-
-
-def _mean(loads: Array) -> Array:
-    """Mean excess load, (num_worlds, 1) [1], of number and sum, (num_worlds, 2)."""
-    return loads[:, 1:] / (ASSUMED_LOADS + loads[:, :1])
+    return memory[:, 1:] / (ASSUMED_LOADS + memory[:, :1]), memory

@@ -38,6 +38,7 @@ class StiffnessMemory(NamedTuple):
         wait: Control steps until the next estimate, (num_worlds,).
         target: Last estimate of r, (num_worlds, n) [1].
         correction: r behind the filter, (num_worlds, n) [1].
+        load: Excess load within the last estimate, (num_worlds, 1) [1]; None for none.
         estimator: Memory of the estimator.
         inner: Memory of the policy.
     """
@@ -45,6 +46,7 @@ class StiffnessMemory(NamedTuple):
     wait: IntArray
     target: Array
     correction: Array
+    load: Array | None
     estimator: Any
     inner: Any
 
@@ -77,28 +79,35 @@ class OnlineStiffness(PolicyAround):
 
     @override
     def begin(self, rows: Array) -> StiffnessMemory:
-        wait = np.zeros(len(rows), dtype=np.int64)
         zero = np.zeros((len(rows), self.view.num_joints))
-        estimator = self.estimator.begin(len(rows))
-        return StiffnessMemory(wait, zero, zero, estimator, self.policy.begin(rows))
+        return StiffnessMemory(
+            wait=np.zeros(len(rows), dtype=np.int64),
+            target=zero,
+            correction=zero,
+            load=np.zeros((len(rows), 1)) if self.estimator.measures_load else None,
+            estimator=self.estimator.begin(len(rows)),
+            inner=self.policy.begin(rows),
+        )
 
     @override
     def act(self, rows: Array, memory: StiffnessMemory, inputs: PolicyInputs) -> Step:
         """Act for a control step; an input `deflection` r' multiplies, (1 + r) (1 + r') δ."""
         wait = memory.wait - 1
         target = memory.target
-        state = memory.estimator
+        load = memory.load
+        estimator = memory.estimator
         if np.count_nonzero(memory.wait) < len(rows):
             due = memory.wait == 0
             wait[due] = self.every - 1
-            estimate, new = self.estimator.estimate(rows[due], select_rows(state, due))
-            estimate = np.clip(estimate, -self.limit, self.limit)
-            target = put_rows(target, due, estimate)
-            state = put_rows(state, due, new)
+            remembered = select_rows(estimator, due)
+            estimate, excess, remembered = self.estimator.estimate(rows[due], remembered)
+            target = put_rows(target, due, np.clip(estimate, -self.limit, self.limit))
+            load = put_rows(load, due, excess)
+            estimator = put_rows(estimator, due, remembered)
         correction = memory.correction + self.share * (target - memory.correction)
         deflection = correction
         if inputs.deflection is not None:
             deflection = (1.0 + correction) * (1.0 + inputs.deflection) - 1.0
-        inputs = inputs._replace(deflection=deflection, load=self.estimator.load(state))
+        inputs = inputs._replace(deflection=deflection, load=load)
         action, inner = self.policy.act(rows, memory.inner, inputs)
-        return action, StiffnessMemory(wait, target, correction, state, inner)
+        return action, StiffnessMemory(wait, target, correction, load, estimator, inner)

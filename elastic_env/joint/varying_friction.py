@@ -13,15 +13,16 @@ from them. A program with its own loop does so in one line:
 Load and speed are those at the beginning of the step: friction lags by one physics step.
 """
 
+import math
 from collections.abc import Callable
-from typing import Self
+from typing import Any, Self
 
 import mujoco
 import numpy as np
 
+from elastic_env.core.compiled import compiled
 from elastic_env.core.signals import Array
-from elastic_env.joint.elasticity import ElasticJoint, joint_torque
-from elastic_env.joint.friction import dry_friction
+from elastic_env.joint.elasticity import ElasticJoint
 from elastic_env.joint.joint_names import JointAddresses, friction_name, spring_name
 
 _TERMS = 4
@@ -71,8 +72,9 @@ class VaryingFriction:
         self._elastic = np.flatnonzero(has_spring)
         self._rigid = np.flatnonzero(~has_spring)
         springs = [model.tendon(spring_name(self.joints[i])).id for i in self._elastic]
-        self._springs = np.array(springs, dtype=np.int64)
-        self._at = at
+        addresses = (at.theta, at.q, at.theta_dot, at.q_dot)
+        ends = [address[self._elastic] for address in addresses]
+        self._springs = np.array([springs, *ends], dtype=np.int64).reshape(5, -1)
 
     @classmethod
     def of(cls, model: mujoco.MjModel) -> Self | None:
@@ -99,41 +101,89 @@ class VaryingFriction:
             field: Returns the rows of a named field of the models, one for each world or for all.
             state: Returns the rows of a named field of the states.
         """
-        terms = field("numeric_data")[:, self.numbers]
-        return dry_friction(
-            speed=state("qvel")[:, self.links],
-            load=self._load(field, state),
-            coulomb=terms[:, 0],
-            load_ratio=terms[:, 1],
-            static=terms[:, 2],
-            stribeck_speed=terms[:, 3],
-        )
-
-    def _load(self, field: _Fields, state: _Fields) -> Array:
-        """τ_J, (num_worlds, n) [N·m].
-
-        A joint without a spring passes the torque of its actuators, less that of its rotor's
-        acceleration in the last physics step.
-        """
-        at = self._at
-        qpos = state("qpos")
         qvel = state("qvel")
-        load = np.zeros((len(qpos), len(self.joints)))
-        if len(elastic := self._elastic):
-            ends = field("tendon_lengthspring")[:, self._springs]
-            load[:, elastic] = joint_torque(
-                qpos[:, at.theta[elastic]] - qpos[:, at.q[elastic]],
-                qvel[:, at.theta_dot[elastic]] - qvel[:, at.q_dot[elastic]],
-                stiffness=field("tendon_stiffness")[:, self._springs],
-                damping=field("tendon_damping")[:, self._springs],
-                backlash=ends[..., 1] - ends[..., 0],
-            )
-        if len(rigid := self._rigid):
-            links = self.links[rigid]
-            rotor = field("dof_armature")[:, links] * state("qacc")[:, links]
-            load[:, rigid] = state("qfrc_actuator")[:, links] - rotor
-        return load
+        load = np.zeros((len(qvel), len(self.joints)))
+        if len(self._rigid):
+            load[:, self._rigid] = self._rigid_load(field, state)
+        if len(self._elastic):
+            springs = [field(f"tendon_{name}") for name in ("stiffness", "damping", "lengthspring")]
+            _set_spring_load(self._elastic, self._springs, *springs, state("qpos"), qvel, load)
+        return _limits(field("numeric_data"), self.numbers, qvel, self.links, load)
+
+    def _rigid_load(self, field: _Fields, state: _Fields) -> Array:
+        """τ_J of the joints without a spring, (num_worlds, k) [N·m].
+
+        Such a joint passes the torque of its actuators, less that of its rotor's acceleration in
+        the last physics step.
+        """
+        links = self.links[self._rigid]
+        rotor = field("dof_armature")[:, links] * state("qacc")[:, links]
+        return state("qfrc_actuator")[:, links] - rotor
 
 
 def _rows_of(data: mujoco.MjData) -> _Fields:
     return lambda name: getattr(data, name)[None]
+
+
+@compiled
+def _set_spring_load(
+    joints: Any,
+    springs: Any,
+    stiffness: Array,
+    damping: Array,
+    lengths: Array,
+    qpos: Array,
+    qvel: Array,
+    load: Array,
+) -> None:
+    """Set τ_J of the joints with springs, see `elasticity.joint_torque`.
+
+    Args:
+        joints: Columns of `load`, (k,).
+        springs: Tendons of the springs, and addresses of θ, q, θ̇ and q̇, (5, k).
+        stiffness: Stiffness of all tendons, for every world or for all (1, ...).
+        damping: Their damping, likewise.
+        lengths: Both ends of their dead bands, likewise.
+        qpos: Positions, (num_worlds, nq).
+        qvel: Speeds, (num_worlds, nv).
+        load: τ_J, (num_worlds, n) [N·m].
+    """
+    for world in range(len(qpos)):
+        for i in range(len(joints)):
+            spring, theta, q, theta_dot, q_dot = springs[:, i]
+            ends = lengths[world % len(lengths), spring]
+            deflection = qpos[world, theta] - qpos[world, q]
+            wound = max(abs(deflection) - (ends[1] - ends[0]) / 2.0, 0.0)
+            deflection = math.copysign(wound, deflection)
+            spring_torque = stiffness[world % len(stiffness), spring] * deflection
+            rate = qvel[world, theta_dot] - qvel[world, q_dot]
+            damper_torque = damping[world % len(damping), spring] * rate
+            load[world, joints[i]] = spring_torque + damper_torque
+
+
+@compiled
+def _limits(data: Array, numbers: Any, qvel: Array, links: Any, load: Array) -> Array:
+    """F of joints under their loads, see `friction.dry_friction`, (num_worlds, n) [N·m].
+
+    Args:
+        data: `numeric_data` of the models, (num_worlds, ...) or (1, ...).
+        numbers: Places of F₀, c, F_s and ω_s in it, (4, n).
+        qvel: Speeds, (num_worlds, nv).
+        links: Degrees of freedom of the links, (n,).
+        load: τ_J, (num_worlds, n) [N·m].
+    """
+    limits = np.empty_like(load)
+    for world in range(len(load)):
+        terms = data[world % len(data)]
+        for i in range(len(links)):
+            speed = qvel[world, links[i]]
+            coulomb = terms[numbers[0, i]]
+            load_ratio = terms[numbers[1, i]]
+            static = terms[numbers[2, i]]
+            stribeck_speed = terms[numbers[3, i]]
+            if stribeck_speed > 0.0:
+                static *= math.exp(-((speed / stribeck_speed) ** 2))
+            elif speed != 0.0:
+                static = 0.0
+            limits[world, i] = coulomb + load_ratio * abs(load[world, i]) + static
+    return limits
