@@ -128,8 +128,8 @@ BROKEN = (
     ),
     BrokenFormula(
         "elastic_env/joint/varying_friction.py",
-        "ends[..., 1] - ends[..., 0]",
-        "ends[..., 1]",
+        "ends[1] - ends[0]",
+        "ends[1]",
         "varying_friction",
     ),
     BrokenFormula(
