@@ -294,8 +294,8 @@ def errors_at_poses(
     ids=["holding", "sagging, gravcomp, springs"],
 )
 def test_static_poses_are_compensated_to_a_hundredth(model: str) -> None:
-    """Catches a servo, a spring or a gravcomp that the compensator does not know, at 12 poses."""
-    both = (errors_at_poses(policy, model, 3, 4, "ideal") for policy in ("uncompensated", "input"))
+    """Catches a servo, a spring or a gravcomp that the compensator does not know, at 4 poses."""
+    both = (errors_at_poses(policy, model, 2, 2, "ideal") for policy in ("uncompensated", "input"))
     without, compensated = (errors["end_effector_error_rms_m"] for errors in both)
     assert (without > 2e-3).all()
     assert np.sqrt(np.square(compensated).mean()) <= 0.01 * np.sqrt(np.square(without).mean())
@@ -315,6 +315,6 @@ def test_what_friction_leaves_is_within_its_bound() -> None:
     ]  # stretched out, where its weight has the longest levers
     mujoco.mj_forward(model, data)
     steepest = np.abs(data.qfrc_bias[1:3]).sum()
-    left = errors_at_poses("input", ARM, 3, 2, "nominal")["link_error_peak_rad"]
+    left = errors_at_poses("input", ARM, 2, 2, "nominal")["link_error_peak_rad"]
     assert (left > 1e-4).all()
     assert (left <= 1.0 / (800.0 - steepest)).all()

@@ -2,22 +2,29 @@
 
 import json
 import re
+from collections.abc import Sequence
+from contextlib import redirect_stdout
+from functools import partial
+from io import StringIO
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import pytest
 import yaml
+from rich.console import Console
 
+import train.commands.bench
 from elastic_env.core.config import load_yaml
 from elastic_env.core.errors import ConfigurationError
 from train.commands.bench import BenchConfig, find_config
 from train.commands.cli import main
 from train.evaluate.conditions import Condition
-from train.evaluate.episodes import evaluate
+from train.evaluate.episodes import Evaluation, evaluate
 from train.runs.github_annotations import annotation
 
 ROOT = Path(__file__).parents[1]
-QUICK = {"kind": "sine", "duration_s": 0.5, "onset_s": 0.5, "amplitude": 0.1}
+QUICK = {"kind": "sine", "duration_s": 0.1, "onset_s": 0.1, "amplitude": 0.1}
+LONGER = {**QUICK, "duration_s": 0.5, "onset_s": 0.5}
 
 
 @pytest.fixture(autouse=True)
@@ -82,27 +89,51 @@ def test_what_was_accepted_is_kept_and_what_got_worse_falls_short(
     assert "falls short" in Path("summary.md").read_text()
 
 
-def test_what_falls_short_stands_first_and_is_an_annotation(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    """Catches a failure at the end of a long table, a change of the wrong sign, options that the
-    policy does not get, and a file that is named as if the checkout were here."""
-    kept = {"env": "testbed", "policy": "input", "reference": QUICK, "episodes": 2}
+class OfTwoCases(NamedTuple):
+    """What came of `elastic bench` with two cases, which its worker processes play."""
+
+    said: list[str]
+    folder: Path
+    evaluations: list[Evaluation]
+
+
+@pytest.fixture(scope="module")
+def of_two_cases(tmp_path_factory: pytest.TempPathFactory) -> OfTwoCases:
+    """Play once for all tests of two cases."""
+    folder = tmp_path_factory.mktemp("two_cases")
+    kept = {"env": "testbed", "policy": "input", "reference": LONGER, "episodes": 2}
     kept["figures"] = {"link_error_rms_rad": 9.0, "link_error_peak_rad": 9.0}
     soft = {**kept, "options": {"stiffness_scale": 0.5}}
     soft["figures"] = {"link_error_rms_rad": 9.0, "link_error_peak_rad": 1e-4}
-    Path("bench.yaml").write_text(yaml.safe_dump({"cases": [kept, soft]}))
-    monkeypatch.setenv("GITHUB_ACTIONS", "true")
-    monkeypatch.setenv("GITHUB_WORKSPACE", str(tmp_path.parent))
-    assert failed(["bench.yaml"])
-    said = capsys.readouterr().out.splitlines()
-    place = f"{tmp_path.name}/bench.yaml"
-    (error,) = (line for line in said if line.startswith(f"::error file={place},title="))
+    (folder / "bench.yaml").write_text(yaml.safe_dump({"cases": [kept, soft]}))
+    evaluations: list[Evaluation] = []
+    play = train.commands.bench.run_conditions
+
+    def noted(conditions: Sequence[Condition], console: Console) -> list[Evaluation]:
+        evaluations.extend(play(conditions, console))
+        return evaluations
+
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(StringIO()) as said:
+        patch.chdir(folder)
+        patch.delenv("GITHUB_STEP_SUMMARY", raising=False)
+        patch.setenv("GITHUB_ACTIONS", "true")
+        patch.setenv("GITHUB_WORKSPACE", str(folder.parent))
+        patch.setattr(train.commands.bench, "run_conditions", noted)
+        assert failed(["bench.yaml"])
+    return OfTwoCases(said.getvalue().splitlines(), folder, evaluations)
+
+
+def test_what_falls_short_stands_first_and_is_an_annotation(of_two_cases: OfTwoCases) -> None:
+    """Catches a failure at the end of a long table, a change of the wrong sign, options that the
+    policy does not get, and a file that is named as if the checkout were here."""
+    folder = of_two_cases.folder
+    begin = f"::error file={folder.name}/bench.yaml,title="
+    (error,) = (line for line in of_two_cases.said if line.startswith(begin))
     assert "link_error_peak_rad is" in error
-    figures = json.loads(Path("runs/bench/bench.json").read_text())
+    figures = json.loads((folder / "runs/bench/bench.json").read_text())
     plain, scaled = (one["measured"] for one in figures if one["metric"] == "link_error_peak_rad")
     assert scaled != plain  # the same episode, so the options alone differ
-    table = Path("runs/bench/bench.md").read_text().splitlines()
+    table = (folder / "runs/bench/bench.md").read_text().splitlines()
     rows = [line for line in table if "link_error" in line or "testbed" in line]
     assert "stiffness_scale" in rows[0]
     assert "falls short" in rows[1]
@@ -115,46 +146,54 @@ def test_what_falls_short_stands_first_and_is_an_annotation(
 
 def test_figures_with_a_sign_are_judged_by_their_size(capsys: pytest.CaptureFixture[str]) -> None:
     """Catches a lowest error that grows tenfold and counts as better."""
-    path = written(figures={"link_error_min_rad": None, "clipped_share": None})
+    signed = partial(written, reference=LONGER)
+    path = signed(figures={"link_error_min_rad": None, "clipped_share": None})
     assert not failed([str(path), "--update"])
     case = yaml.safe_load(path.read_text())["cases"][0]
     accepted = case["figures"]["link_error_min_rad"]
     assert accepted < 0.0
     assert case["figures"]["clipped_share"] == 0.0
-    assert not failed([str(written(figures={"link_error_min_rad": accepted}))])
-    assert failed([str(written(figures={"link_error_min_rad": 0.1 * accepted}))])
+    assert not failed([str(signed(figures={"link_error_min_rad": accepted}))])
+    assert failed([str(signed(figures={"link_error_min_rad": 0.1 * accepted}))])
     assert "(+900." in capsys.readouterr().out
-    assert not failed([str(written(figures={"link_error_min_rad": 10.0 * accepted}))])
+    assert not failed([str(signed(figures={"link_error_min_rad": 10.0 * accepted}))])
     assert "better" in capsys.readouterr().out
 
 
 def test_an_update_fits_without_margin_and_changes_figures_alone(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """Catches digits that were rounded away and fail at once, line ends that change, figures of
-    another case that end in a traceback, and an update that says what it did not do."""
+    """Catches digits that were rounded away and fail at once, line ends that change, and an update
+    that does not say what it did."""
     path = written(margins={"link_error_rms_rad": 0.0})
     path.write_bytes(path.read_bytes().replace(b"\n", b"\r\n"))
     assert not failed([str(path), "--update"])
     assert "accepted 1 of 1 figures" in capsys.readouterr().out
     assert path.read_bytes().count(b"\n") == path.read_bytes().count(b"\r\n") > 3
     assert not failed([str(path)])
-    case = "{<<: *a, seed: 3}"
-    path.write_text(path.read_text().replace("- env", "- &a\n  env", 1) + f"- {case}\n")
-    with pytest.raises(SystemExit) as end:
-        main(["bench", str(path), "--update"])
-    assert end.value.code == 2
-    assert "figures of cases.1 stand elsewhere" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("named", "case"),
+    [
+        (("- env", "- &a\n  env"), "{<<: *a, seed: 3}"),
+        (("figures:", "figures: &a"), "{env: testbed, policy: zero, figures: *a}"),
+        (("", ""), "{env: testbed, policy: zero, figures: {<<: {link_error_rms_rad: 1.0}}}"),
+    ],
+)
 def test_an_update_refuses_figures_that_two_cases_share(
+    named: tuple[str, str],
+    case: str,
+    of_two_cases: OfTwoCases,
     capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Catches figures of one case that take the place of another one's, which then falls
-    short."""
+    """Catches figures of one case that take the place of another one's, which then falls short, and
+    figures of another case that end in a traceback."""
+    played = of_two_cases.evaluations
+    monkeypatch.setattr(train.commands.bench, "run_conditions", lambda *_: played)
     path = written()
-    case = "{env: testbed, policy: zero, reference: {kind: sine, duration_s: 0.3}, figures: *a}"
-    path.write_text(path.read_text().replace("figures:", "figures: &a") + f"- {case}\n")
+    path.write_text(path.read_text().replace(*named, 1) + f"- {case}\n")
     before = path.read_bytes()
     with pytest.raises(SystemExit) as end:
         main(["bench", str(path), "--update"])

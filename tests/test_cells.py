@@ -174,7 +174,7 @@ def unpacked(size: int) -> bytes:
     """A small archive of a large array."""
     content = io.BytesIO()
     with (
-        zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive,
+        zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive,
         archive.open("episodes.npy", "w") as part,
     ):
         for _ in range(size // 10_000_000):

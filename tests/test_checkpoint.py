@@ -33,7 +33,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A training seed that was interrupted behind a checkpoint."""
     folder = tmp_path_factory.mktemp("trained")
     with pytest.raises(KeyboardInterrupt):
-        Training(TrainConfig(**{**SMALL, **PPO}), 1, folder).run(interrupted_after(96))
+        Training(TrainConfig(**{**SMALL, **PPO}), 1, folder).run(interrupted_after(48))
     return folder
 
 

@@ -360,7 +360,7 @@ def test_without_friction_the_compensator_ignores_the_friction_of_the_model() ->
 def test_dynamic_compensator_follows_a_sine_that_gravity_alone_does_not() -> None:
     """Catches a wrong share of D, B, servo or timing: on the ideal plant `dynamic` is ten times
     better than `input`."""
-    reference = {"kind": "sine", "frequency_hz": 0.25, "duration_s": 2.0, "onset_s": 2.0}
+    reference = {"kind": "sine", "frequency_hz": 0.25, "duration_s": 1.0, "onset_s": 1.0}
     rms = {
         name: (
             evaluate(

@@ -249,7 +249,7 @@ def test_what_had_been_played_before_a_worker_was_killed_is_kept(tmp_path: Path)
 
 def test_output_that_nobody_reads_is_no_traceback(tmp_path: Path) -> None:
     """Catches BrokenPipeError, also where the interpreter flushes at its end."""
-    code = f"{sys.executable} -c 'from train.commands.entry import main; main()' evaluate --help"
+    code = f"{sys.executable} -c 'from train.commands.entry import main; main()' --help"
     run = subprocess.run(
         f"{code} | head -n 1", shell=True, capture_output=True, text=True, timeout=120, check=True
     )

@@ -99,4 +99,5 @@ def test_the_strip_marks_what_the_metrics_count(
     assert ramp.spans == [(0.0, pytest.approx(1.0))]
     (own,) = scored.spans
     assert own == pytest.approx(spans, abs=1.5 * period_s)
-    assert draw_chart(chart, tmp_path / "x.png").exists()
+    if env == "walker":
+        assert draw_chart(chart, tmp_path / "x.png").exists()

@@ -102,7 +102,7 @@ def test_feet_that_land_off_by_a_constant_come_to_their_footholds() -> None:
 
 def test_a_force_sensor_that_is_off_does_not_let_the_feet_walk_away() -> None:
     """Catches errors that add up: left and right take turns, so a constant one must not."""
-    legs = ClosedLegs(walker(num_steps=16))
+    legs = ClosedLegs(walker(num_steps=16, step_period=1.1))
     bias_n = 10.0
     legs.walk(bias_n)
     wide = GAINS.compliance_m_n * bias_n / 2.0
@@ -111,16 +111,24 @@ def test_a_force_sensor_that_is_off_does_not_let_the_feet_walk_away() -> None:
 
 def test_feet_do_not_walk_forward_by_what_their_shear_hides() -> None:
     """Catches a rate of the load that is left out, or has the sign of the other foot."""
+    steps = 20
+    period_s = 1.1
     ends = []
+    later = []
     for load_rate_m_s in (0.0, GAINS.load_rate_m_s):
-        legs = ClosedLegs(walker(num_steps=40), GAINS.replace(load_rate_m_s=load_rate_m_s))
+        env = walker(num_steps=steps, step_period=period_s)
+        legs = ClosedLegs(env, GAINS.replace(load_rate_m_s=load_rate_m_s))
         legs.walk()
         ends.append(legs.place.mean(axis=0))
+        later.append(ends[-1] - legs.landed[steps // 2 - 1].mean(axis=0))
     share = legs.plan.share
-    shared = (share > 0.25) & (share < 0.75)
+    walked_s = legs.plan.timing.time - 1.0
+    between = (walked_s > period_s) & (walked_s < (steps - 1) * period_s)
+    shared = (share > 0.25) & (share < 0.75) & between
     rate = np.gradient(share, legs.model.control_period_s)[shared]
     a_step = GAINS.load_rate_m_s * np.abs(rate).mean()
-    assert ends[0][0] == pytest.approx(40 * a_step, rel=0.1)
+    assert len(legs.landed) == steps
+    assert later[0][0] == pytest.approx(steps / 2 * a_step, rel=0.1)
     assert abs(ends[1][0]) < 1e-4
     assert abs(ends[0][1]) < 1e-4
 
@@ -134,7 +142,7 @@ def test_an_offset_that_goes_before_the_load_comes_needs_no_true_compliance() ->
     drift = []
     for return_load in (1.0, 0.25):
         gains = GAINS.replace(return_load=return_load, load_rate_m_s=0.0)
-        legs = ClosedLegs(walker(num_steps=16), gains)
+        legs = ClosedLegs(walker(num_steps=16, step_period=1.1), gains)
         legs.load_rate_m_s = 0.0
         legs.compliance_m_n = GAINS.compliance_m_n / 1.25
         legs.landing_m = np.full((2, 2), [0.005, 0.0])
@@ -177,7 +185,7 @@ def test_the_base_of_foothold_follows_the_gait() -> None:
         named = baselines.make("foothold", env)
         explicit = baselines.make("foothold", env, **base)
         states: list[Any] = [None, None]
-        for _ in range(100):
+        for _ in range(30):
             action, states[0] = named.predict(rows, states[0])
             same, states[1] = explicit.predict(rows, states[1])
             np.testing.assert_array_equal(action, same)

@@ -34,7 +34,7 @@ def made(robot: str, worlds: int = 2, **arguments: Any) -> Any:
     )
 
 
-def played(env: Any, steps: int = 60) -> Array:
+def played(env: Any, steps: int = 30) -> Array:
     observation, _ = env.reset(seed=3)
     generator = np.random.default_rng(0)
     for _ in range(steps):

@@ -62,7 +62,7 @@ def sides(model: mujoco.MjModel, hinges: list[str]) -> tuple[list[int], list[int
 
 
 @pytest.mark.parametrize("name", GALLERY)
-def test_a_robot_with_elastic_hinges_moves_for_ten_seconds(name: str) -> None:
+def test_a_robot_with_elastic_hinges_moves_for_four_seconds(name: str) -> None:
     """Catches a hinge that stayed rigid, a spring that explodes or swings up, and a reset that
     would hide it."""
     model = elastic(name)
@@ -75,12 +75,12 @@ def test_a_robot_with_elastic_hinges_moves_for_ten_seconds(name: str) -> None:
     omega = 2.0 * np.pi * np.linspace(0.2, 0.5, len(hinges))
     largest = 0.0
     early = 0.0
-    for step in range(2500):
+    for step in range(1000):
         data.ctrl[:] = home + 0.2 * np.sin(omega * data.time)
         mujoco.mj_step(model, data, 4)
         largest = max(largest, float(np.abs(data.qpos[rotors] - data.qpos[links]).max()))
-        early = largest if step == 1250 else early
-    assert data.time == pytest.approx(10.0)
+        early = largest if step == 500 else early
+    assert data.time == pytest.approx(4.0)
     assert not data.warning.number.any()
     assert 5e-3 < largest < 0.05
     assert largest < 1.5 * early, "it swings up"

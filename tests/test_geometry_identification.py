@@ -168,14 +168,14 @@ def test_a_joint_that_gravity_almost_overcomes_still_rests(geometry: GeometryMod
         return float(softness * geometry.moments(rests)[0, 1, 2])
 
     rests, tips = 1e-3, 10.0
-    while tips - rests > 1e-4 * rests:
+    while tips - rests > 5e-4 * rests:
         softness = 0.5 * (rests + tips)
         try:
             turn(softness)
             rests = softness
         except ElasticError:
             tips = softness
-    near, nearer = 0.998 * rests, 0.999 * rests
+    near, nearer = 0.997 * rests, 0.998 * rests
     turned = turn(nearer)
     slope = (turned - turn(near)) / (nearer - near)
     kappa = 1.0 - turned / nearer / slope
@@ -249,7 +249,7 @@ def made_up(
 def test_intervals_hold_the_truth(geometry: GeometryModel, options: dict[str, object]) -> None:
     """Of 95 % in at least 90 %: catches a wrong covariance, and a noise that is not estimated."""
     held = []
-    for seed in range(3):
+    for seed in range(2):
         problem, truth = made_up(geometry, seed, count=30, noise_m=5e-4, **options)
         fit = fit_geometry(problem)
         assert fit.noise_m == pytest.approx(5e-4, rel=0.25)
@@ -482,13 +482,13 @@ def test_joints_that_are_not_in_the_log_stand_where_the_keyframe_has_them() -> N
 
 def test_folds_hold_out_each_pose_once(geometry: GeometryModel) -> None:
     """Catches a pose that is fitted and judged, and a curve over other poses."""
-    problem, _ = made_up(geometry, 8, count=40, noise_m=5e-4, geometry="offsets")
-    parts = split(40, share=0.3, folds=4, seed=0)
-    assert sorted(np.concatenate(parts)) == list(range(40))
+    problem, _ = made_up(geometry, 8, count=30, noise_m=5e-4, geometry="offsets")
+    parts = split(30, share=0.3, folds=3, seed=0)
+    assert sorted(np.concatenate(parts)) == list(range(30))
     held_out = judge(HoldoutProblem.from_geometry(problem), parts, 0, lambda done: None)
-    assert held_out.held_out == 40
+    assert held_out.held_out == 30
     assert held_out.is_ahead
-    assert [point.poses for point in held_out.curve] == [15, 30]
+    assert [point.poses for point in held_out.curve] == [10, 20]
 
 
 @pytest.mark.parametrize(

@@ -52,7 +52,7 @@ def test_every_id_is_here_or_is_hardware() -> None:
 
 @pytest.mark.parametrize("name", IDS)
 def test_gymnasiums_checker_finds_nothing(name: str) -> None:
-    """Catches spaces, dtypes, seeding, rendering and return types that are not Gymnasium's."""
+    """Catches spaces, dtypes, seeding and return types that are not Gymnasium's."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         warnings.filterwarnings(
@@ -65,6 +65,15 @@ def test_gymnasiums_checker_finds_nothing(name: str) -> None:
             "ignore", message=".*recommended to use a symmetric and normalized.*"
         )
         check_env(make(name).unwrapped, skip_render_check=True)  # which opens windows
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=[pytest.mark.slow] * ("Testbed" not in n)) for n in IDS]
+)
+def test_drawing_warns_of_nothing(name: str) -> None:
+    """Catches a warning of Gymnasium, MuJoCo or the renderer where an environment is drawn."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
         drawn = make(name, render_mode="rgb_array")
         drawn.reset(seed=0)
         drawn.render()
@@ -153,8 +162,8 @@ def test_a_step_before_the_reset_is_refused(name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "name",  # robots of any joints are drawn as the testbed is
-    [pytest.param(n, marks=[pytest.mark.slow] * ("Robot-v0" in n)) for n in IDS],
+    "name",  # all are drawn by one class
+    [pytest.param(n, marks=[pytest.mark.slow] * ("Testbed" not in n)) for n in IDS],
 )
 def test_a_vector_environment_draws_its_worlds(name: str) -> None:
     """Catches frames that all show the first world."""

@@ -54,7 +54,7 @@ from tests.hardware_trials.trials import compare_replies
 from tests.lines import looped
 from tests.test_hardware_arm_servos import servos
 from tests.test_hardware_faults import SERVO, Case, named
-from train.commands import hardware_arm_dry_run, hardware_compensate
+from train.commands import hardware_arm_checks, hardware_arm_dry_run, hardware_compensate
 from train.commands.cli import main
 from train.commands.hardware import Emulate
 from train.commands.hardware_arm import ArmSetup
@@ -77,7 +77,13 @@ HOME = np.array([0.0, -0.5, 0.5, 0.3, 0.0, 0.3])
 MODEL = mujoco.MjModel.from_xml_path(ROBOT)
 LOWEST, HIGHEST = MODEL.jnt_range.T
 TOOL = EndEffector(MODEL, NAMES, "tip")
-SETTINGS = load_yaml(MOUNTING, ArmSettings, {"port": "virtual"})
+LINKS = RigidBody(MODEL, NAMES)
+RATE_HZ = 50.0
+SETTINGS = load_yaml(MOUNTING, ArmSettings, {"port": "virtual", "rate_hz": RATE_HZ})
+"""At the lowest rate, which simulates the fastest."""
+USUAL = SETTINGS.replace(rate_hz=100.0)
+USUAL_S = 0.01
+"""At the rate of a mounting that names none."""
 OPTIONS = Compensate(robot=ROBOT, joints=JOINTS, mounting=MOUNTING, port="virtual")
 
 
@@ -92,7 +98,7 @@ class Plain:
 
 
 def compensator(**options: Any) -> PositionCompensator:
-    defaults = {"limit_rad": 0.3, "ramp_s": 0.5, "period_s": 0.01}
+    defaults = {"limit_rad": 0.3, "ramp_s": 0.5, "period_s": 1.0 / RATE_HZ}
     return PositionCompensator.from_model(ROBOT, options.pop("file", JOINTS), **defaults | options)
 
 
@@ -169,14 +175,15 @@ def test_compensation_places_the_tip_from_both_sides(tmp_path: Path) -> None:
     """Catches a sign, a zero or a delay between target and wire: the true links of an emulated
     SO-101 (P gain 16), seen through the bus; and a result that needs the exact parameters."""
     poses = drawn(1)
+    home = dict(zip(NAMES, (poses[0] - 0.15).tolist(), strict=True))  # no long way to begin with
     found = {}
     for name, commands in (
         ("plain", Plain()),
-        ("exact", compensator()),
-        ("misjudged", compensator(file=misjudged(tmp_path))),
+        ("exact", compensator(period_s=USUAL_S)),
+        ("misjudged", compensator(period_s=USUAL_S, file=misjudged(tmp_path))),
     ):
-        virtual = virtual_arm(emulated())
-        arm = begun(virtual, commands)
+        virtual = virtual_arm(emulated(home=home))
+        arm = begun(virtual, commands, USUAL)
         found[name] = placed(rests(arm, virtual, poses), poses)
     assert found["plain"][0] > 0.015
     assert found["plain"][1] > 0.010
@@ -191,9 +198,10 @@ def test_thirty_poses_from_both_sides() -> None:
     """Catches a gain that three poses show by chance: the check of docs/hardware.md."""
     poses = drawn(30)
     virtual = virtual_arm(emulated())
-    plain = placed(rests(begun(virtual, Plain()), virtual, poses, 1.0), poses)
+    plain = placed(rests(begun(virtual, Plain(), USUAL), virtual, poses, 1.0), poses)
     virtual = virtual_arm(emulated())
-    best = placed(rests(begun(virtual, compensator()), virtual, poses, 1.0), poses)
+    arm = begun(virtual, compensator(period_s=USUAL_S), USUAL)
+    best = placed(rests(arm, virtual, poses, 1.0), poses)
     print(f"tip {1e3 * plain[0]:.1f} to {1e3 * best[0]:.2f} mm", end=", ")
     print(f"spread {1e3 * plain[1]:.1f} to {1e3 * best[1]:.2f} mm")
     assert best[0] < plain[0] / 3.0
@@ -242,7 +250,7 @@ def test_directions_and_zeros_of_the_mounting_are_those_of_the_arm() -> None:
         name: {"id": i, "direction": sign, "zero_rad": at}
         for i, (name, sign, at) in enumerate(own, 1)
     }
-    settings = ArmSettings(port="virtual", joints=joints, limits=ARM_LIMITS)  # type: ignore[arg-type]
+    settings = SETTINGS.replace(joints=joints, limits=ARM_LIMITS)
     arm = begun(virtual, compensator(), settings)
     np.testing.assert_allclose(arm.start, HOME, atol=1e-3)
     pose = drawn(1)
@@ -255,7 +263,7 @@ def test_loads_tell_which_sign_is_wrong(seed: int, turned: int | None) -> None:
     """Catches a joint that is blamed for another's sign, and a right arm that is blamed at all,
     under friction and a mass that is 15 % off."""
     generator = np.random.default_rng(seed)
-    links = RigidBody(MODEL, NAMES)
+    links = LINKS
     q = np.clip(HOME + generator.uniform(-0.6, 0.6, 6), LOWEST, HIGHEST)
     true = 1.15 * links.gravity_torque(q)
     sign = np.ones(6)
@@ -278,16 +286,30 @@ servo: {position_gain: 11.95, velocity_gain: 0.53}"""
 
 def joints_table(virtual: VirtualBus, joints_file: Path) -> str:
     """What is said of an arm whose joints are moved a little."""
-    arm = begun(virtual, compensator(), SETTINGS.replace(rate_hz=50.0))
+    arm = begun(virtual, compensator())
     text = io.StringIO()
     check_joints(arm, ArmSetup(OPTIONS, joints_file), PlainConsole(file=text, width=120))
     return text.getvalue()
 
 
+def remarks(arm: live.Arm, *joints: str) -> list[str]:
+    """What the table says of some joints after they have moved a little."""
+    setup = ArmSetup(OPTIONS, JOINTS)
+    found = []
+    for joint in map(NAMES.index, joints):
+        check = check_joint(arm, joint, OPTIONS.nudge_rad)
+        assert check.follow_ratio > 0.6
+        found.append(hardware_arm_checks._joint_row(setup, joint, check)[-1])
+    return found
+
+
 def test_a_wrong_zero_shows_in_the_loads() -> None:
     """Catches a zero that is off by a quarter turn without a word."""
     virtual = virtual_arm(emulated(zero_rad=(0.0, 1.4, 0.0, 0.0, 0.0, 0.0)))
-    assert "look at zero_rad" in joints_table(virtual, JOINTS)
+    assert remarks(begun(virtual, compensator()), "elbow_flex") == ["load"]
+    virtual = virtual_arm(emulated())
+    assert remarks(begun(virtual, compensator()), "elbow_flex") == [""]
+    assert "look at zero_rad" in hardware_arm_checks._REMARKS["load"]
 
 
 @pytest.mark.filterwarnings("ignore:.*taken for rigid")
@@ -333,14 +355,9 @@ def test_an_arm_that_fell_on_its_stops_passes_its_check() -> None:
     begun(bus, Plain()).close()
     bus.sleep(2.0)
     assert bus.links[1] > HIGHEST[1]
-    arm = begun(bus, compensator(), SETTINGS.replace(rate_hz=50.0))
+    arm = begun(bus, compensator())
     assert arm.start[1] == pytest.approx(HIGHEST[1])
-    text = io.StringIO()
-    check_joints(arm, ArmSetup(OPTIONS, JOINTS), PlainConsole(file=text, width=120))
-    follows = re.search(r"shoulder_lift\W+(\d+) %", text.getvalue())
-    assert follows is not None
-    assert int(follows[1]) > 60
-    assert "look at zero_rad" not in text.getvalue()
+    assert remarks(arm, "shoulder_lift", "elbow_flex") == ["", "light"]
     assert arm.counts.limited <= 1  # the first, onto the range
 
 
@@ -388,8 +405,8 @@ def test_goals_stay_within_the_ranges_of_each_joint() -> None:
     narrow = SETTINGS.replace(limits=ARM_LIMITS.replace(highest_rad=0.6))
     arm = begun(virtual, Plain(), narrow)
     goals = []
-    for _ in range(400):
-        arm.follower.step(np.full(6, 1.0), 0.01)
+    for _ in range(200):
+        arm.follower.step(np.full(6, 1.0), 1.0 / RATE_HZ)
         goals.append(arm.cycle(np.full(6, 1.0)).command)
     assert np.array(goals).max(axis=0) == pytest.approx(0.6)
     assert arm.counts.limited > 0
@@ -398,7 +415,7 @@ def test_goals_stay_within_the_ranges_of_each_joint() -> None:
 
 
 @given(
-    st.lists(st.floats(-1.0, 1.0), min_size=1, max_size=4),
+    st.lists(st.floats(-1.0, 1.0), min_size=1, max_size=2),
     st.sampled_from([0.005, 0.01, 0.02]),
 )
 def test_desired_angles_reach_every_target_without_overshoot(
@@ -659,19 +676,19 @@ def test_settings_with_which_nothing_may_move_are_named(
 def test_the_log_is_one_that_identify_reads(tmp_path: Path) -> None:
     """Catches a column or a sign that the identification of servos would not take: the load that
     turns the joint forward, against the torque that holds it."""
-    states, files = logged(tmp_path, compensator(), drawn(1))
+    states, files = logged(tmp_path, compensator(period_s=USUAL_S), drawn(1))
     assert [one.name for one in files] == [f"servo_{name}.csv" for name in NAMES[1:4]]
     read = read_servo_log(files[1], joint="elbow_flex")
     assert len(read) == len(states)
     assert read.known_torque is not None
-    weight = RigidBody(MODEL, NAMES).gravity_torque(states[-1].theta)
+    weight = LINKS.gravity_torque(states[-1].theta)
     np.testing.assert_allclose(read.known_torque[-1], -weight[2], rtol=1e-3)
     assert np.sign(states[-1].torque[2]) == -np.sign(read.known_torque[-1])
 
 
 def logged(folder: Path, commands: Any, poses: Array) -> tuple[list[ArmState], list[Path]]:
     """What an arm does at poses, and the logs of its servos."""
-    arm = begun(virtual_arm(emulated()), commands)
+    arm = begun(virtual_arm(emulated()), commands, USUAL)
     states = list(arm.play(Poses(poses, 0.5)))
     path = folder / "log.csv"
     with path.open("w") as file:
@@ -750,7 +767,14 @@ def emulator() -> RunningEmulator:
     return RunningEmulator(config)
 
 
-@pytest.mark.parametrize("joints", ["rigid", {"stiffness": 300}], ids=["rigid", "diverging"])
+@pytest.mark.parametrize(
+    "joints",
+    [
+        pytest.param("rigid", id="rigid"),
+        # the dry run of such joints says the same on every commit
+        pytest.param({"stiffness": 300}, id="diverging", marks=pytest.mark.slow),
+    ],
+)
 def test_an_emulator_that_ends_by_itself_says_why(joints: Any) -> None:
     """Catches a traceback of the emulator's process, an exit code of success, and a broken pipe."""
     config = EmulatorConfig(
@@ -773,7 +797,6 @@ TWELVE = tuple(range(1, 13))
 TWELVE_NAMES = (*NAMES, *(f"other_{name}" for name in NAMES))
 PATIENCE = 10
 RELEASE_S = 0.3
-RATE_HZ = 50.0
 
 
 @functools.cache
@@ -905,14 +928,17 @@ class WatchedBus(VirtualBus):
         return cycle
 
 
-AS_LOST = {"corrupted=1.0", "truncated=1.0", "silent=True"}
-"""Faults after which no reply is usable, as when all are lost."""
+OF_EACH_KIND = {
+    *("lost=0.1", "lost=1.0", "unheard=1.0", "late=0.01,late_s=0.03"),
+    *("overload=True", "hot=True", "same_id=True", "unplugged=True"),
+}
+"""Faults that differ for an arm: the others leave replies unusable, some or all, as lost ones."""
 
 
 @pytest.mark.parametrize(
     "case",
     [
-        pytest.param(case, marks=pytest.mark.slow) if named(case) in AS_LOST else case
+        case if named(case) in OF_EACH_KIND else pytest.param(case, marks=pytest.mark.slow)
         for case in ON_ARM
     ],
     ids=named,
@@ -975,10 +1001,12 @@ def test_a_dry_run_by_the_command_line(tmp_path: Path, capsys: pytest.CaptureFix
     poses = tmp_path / "poses.csv"
     # without a check the elbow, which stays, rests where its friction leaves it
     poses.write_text(f"{POSES.splitlines()[0]}\n0,0.1,0,0,0,0\n")
+    mounting = tmp_path / "mounting.yaml"
+    mounting.write_text(f"{SOUND}\nrate_hz: {RATE_HZ}\n")
     main(
         [
             *("hardware", "compensate", "--robot", ROBOT, "--joints", str(JOINTS)),
-            *("--mounting", str(MOUNTING), "--targets", str(poses)),
+            *("--mounting", str(mounting), "--targets", str(poses)),
             *("--dry-run", "--no-check", "--output", str(tmp_path / "run")),
         ]
     )
@@ -989,7 +1017,7 @@ def test_a_dry_run_by_the_command_line(tmp_path: Path, capsys: pytest.CaptureFix
     assert estimated != true
     assert true < 0.5 * plain
     table = np.genfromtxt(tmp_path / "run" / "log.csv", delimiter=",", names=True)
-    assert len(table) > 150
+    assert len(table) > 1.5 * RATE_HZ
     assert (tmp_path / "run" / "servo_elbow_flex.csv").is_file()
 
 
@@ -1011,7 +1039,7 @@ def test_a_dry_run_of_joints_that_are_hard_to_simulate(
     joints = tmp_path / "joints.yaml"
     joints.write_text(f'"*": {stiffness}\n')
     poses = tmp_path / "poses.csv"
-    poses.write_text("\n".join(POSES.splitlines()[:2]) + "\n")
+    poses.write_text(f"{POSES.splitlines()[0]}\n0,0.1,0,0,0,0\n")
     arguments = [
         *("hardware", "compensate", "--robot", ROBOT, "--joints", str(joints)),
         *("--mounting", str(MOUNTING), "--targets", str(poses)),

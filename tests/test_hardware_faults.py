@@ -71,7 +71,8 @@ SERVO = [
     Case({"same_id": True}, stops="no usable reply"),
     Case({"unplugged": True}, stops="is gone"),
 ]
-IN_PROCESSES = {"unheard=1.0", "corrupted=0.1", "hot=True", "unplugged=True"}
+IN_PROCESSES = {"hot=True", "unplugged=True"}
+"""Faults that are played to real processes on every commit, all of them every night."""
 IMU = [
     Case({"imu_silent": True}, stops=r"has sent no attitude for \d+ ms"),
     Case({"imu_late_s": 0.02}, goes_on="attitudes are younger than imu_oldest_s"),

@@ -47,7 +47,8 @@ def plant(folder: Path) -> Path:
     return said
 
 
-@pytest.mark.parametrize("path", [pytest.param(None, marks=pytest.mark.slow), f".{os.pathsep}"])
+@pytest.mark.slow
+@pytest.mark.parametrize("path", [None, f".{os.pathsep}"])
 def test_nothing_of_the_working_directory_runs_in_a_child(
     path: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -73,6 +74,24 @@ def test_nothing_of_the_working_directory_runs_in_a_child(
             check=False,
         )
     assert "/dev/ttyNOTHING: there is no such device" in done.stdout
+    assert not said.exists(), said.read_text()
+
+
+def test_the_command_of_a_child_finds_nothing_in_the_working_directory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches a child's command, or its environment, by which planted modules are imported."""
+    said = plant(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PYTHONPATH", f".{os.pathsep}")
+    done = subprocess.run(
+        child_command("elastic_env.hardware.buses.port"),
+        env=child_environment(),
+        capture_output=True,
+        timeout=60,
+        check=False,
+    )
+    assert done.returncode == 0
     assert not said.exists(), said.read_text()
 
 

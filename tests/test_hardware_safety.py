@@ -9,6 +9,7 @@ import sys
 import time
 import tty
 from collections.abc import Iterator
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -321,7 +322,7 @@ def test_second_program_is_told_which_port_is_taken(
 
 def test_servos_follow_and_torque_goes_off_at_the_end(emulator: RunningEmulator) -> None:
     """Catches goals that do not arrive in the servos' units, and a program that ends with torque
-    on."""
+    on, by itself or by Ctrl-C."""
     with SupervisedBus({emulator.port: [1, 2]}) as bus:
         start = bus.enable(PATIENT)
         begin = time.monotonic()
@@ -329,6 +330,13 @@ def test_servos_follow_and_torque_goes_off_at_the_end(emulator: RunningEmulator)
             share = min(elapsed / 0.4, 1.0)
             cycle(bus, (start + share * (np.array([0.1, -0.1]) - start)).tolist())
         assert emulator.state()["theta"] == pytest.approx([0.1, -0.1], abs=0.02)
+    assert emulator.state()["torque_on"] == [False, False]
+    wait_until_rest(emulator)
+    with suppress(KeyboardInterrupt), SupervisedBus({emulator.port: [1, 2]}) as bus:
+        cycle(bus, bus.enable(PATIENT).tolist(), 5)
+        assert emulator.state()["torque_on"] == [True, True]
+        signal.raise_signal(signal.SIGINT)
+        pytest.fail("nothing was interrupted")
     assert emulator.state()["torque_on"] == [False, False]
 
 
@@ -412,7 +420,11 @@ def test_ids_that_cannot_be_are_refused_before_anything_starts() -> None:
 
 @pytest.mark.parametrize(
     "how",
-    ["kill", pytest.param("stop", marks=pytest.mark.slow), "interrupt", "kill-supervisor"],
+    [
+        "kill",
+        "kill-supervisor",
+        *(pytest.param(how, marks=pytest.mark.slow) for how in ("stop", "interrupt")),
+    ],
 )
 def test_torque_goes_off_whatever_ends_the_program(emulator: RunningEmulator, how: str) -> None:
     """Catches every way of leaving a servo under torque: death, hang, Ctrl-C, and the death of

@@ -334,10 +334,18 @@ def test_the_last_step_tells_of_itself_and_not_of_the_way_back(still: StillBus) 
     assert torques[-1] == pytest.approx(1.0 + info["reference_angle"] + 0.2)
 
 
+def test_nothing_that_was_measured_is_not_met() -> None:
+    """Catches a traceback that ends all other measurements with it."""
+    trial = hardware_trials._ending("killed", "torque off", 2, [], 2)
+    assert not trial.is_met
+    assert "all 2 tries had stopped" in trial.measured
+
+
+@pytest.mark.slow
 def test_a_measurement_of_which_every_try_is_spoiled_is_not_met(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Catches a traceback that ends all other measurements with it."""
+    """Catches a measurement that tries for ever, or that ends in a traceback."""
     monkeypatch.setattr(hardware_trials, "_end_once", lambda *_: None)
     trial = hardware_trials.TRIALS["killed"](0.02)
     assert not trial.is_met

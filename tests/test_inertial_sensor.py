@@ -425,7 +425,7 @@ def test_the_links_error_at_rest_is_that_of_the_data_sheet_and_stays() -> None:
     assert np.sqrt(np.square(error).mean()) == pytest.approx(
         math.radians(0.25), rel=5 / math.sqrt(2 * 256)
     )
-    for _ in range(25):
+    for _ in range(10):
         observation, _, _, _, info = env.step(np.zeros((256, 1), np.float32))
     np.testing.assert_allclose(observation[:, 6] - info["link_angle"], error, rtol=0.0, atol=1e-6)
 

@@ -32,7 +32,7 @@ from train.evaluate.conditions import Condition, PolicySpec
 from train.evaluate.episodes import evaluate
 
 PERIOD_S = 0.004
-SINE = {"kind": "sine", "amplitude": 0.2, "duration_s": 0.8, "onset_s": 0.3}
+SINE = {"kind": "sine", "amplitude": 0.2, "duration_s": 0.4, "onset_s": 0.2}
 SHORT = LearningGains(trials=3)
 GAIN = ChannelGains(gain=0.5, lead_s=0.0, cutoff_hz=4.0, surprise=1e3, limit=1e3)
 
@@ -182,7 +182,7 @@ def test_the_center_of_mass_moves_as_a_pendulum_has_to() -> None:
 def test_every_offset_of_the_walker_acts_against_its_error() -> None:
     """Catches a handle with the wrong sign, in double and in single support, by playing each on
     a real walk."""
-    env = make_walker(5, scenario="ideal", step_period=[0.5, 0.5, 0.5])
+    env = make_walker(5, scenario="ideal", step_period=[0.3, 0.5, 0.3])
     policy = baselines.make("iterative", env)
     size = np.array([5e-3, 5e-3, 0.01, 0.01])
     tables = np.zeros((5, env.unwrapped.task.num_steps + 1, 4))
@@ -193,16 +193,16 @@ def test_every_offset_of_the_walker_acts_against_its_error() -> None:
     asked, _ = env.reset(seed=[3] * 5)
     state = None
     found = []
-    for _ in range(env.unwrapped.task.num_steps):
+    timing = env.unwrapped.task.plan.timing
+    for _ in range(np.flatnonzero(timing.walking)[-1]):
         action, state = policy.predict(asked, state=state, episode_start=np.full(5, state is None))
         seen, _, _, _, info = env.step(action)
         found.append(signals.error(asked, seen, info))
         asked = seen
     change = np.array(found)[:, 1:] - np.array(found)[:, :1]
-    timing = env.unwrapped.task.plan.timing
     of_steps = {"double": timing.walking & ~timing.single, "single": timing.single}
     for name, rows in of_steps.items():
-        mean = change[rows[1:]].mean(axis=0)
+        mean = change[rows[1 : len(change) + 1]].mean(axis=0)
         for column in range(4):
             share = -mean[column, column] / size[column]
             assert 0.05 < share < 1.6, (name, column, share)
@@ -341,7 +341,7 @@ def test_what_was_learned_is_saved_and_played(run: Path) -> None:
 
 def test_another_motion_or_robot_is_refused(run: Path) -> None:
     """Catches offsets that are played in a motion that they are wrong for."""
-    for change in ({"amplitude": 0.1}, {"duration_s": 0.6}):
+    for change in ({"amplitude": 0.1}, {"duration_s": 0.3}):
         env = make_testbed(reference={**SINE, **change})
         with pytest.raises(ConfigurationError, match=r"amplitude|number of rows"):
             baselines.make(f"iterative:{run}", env)

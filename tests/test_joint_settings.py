@@ -365,7 +365,9 @@ def test_an_assumed_rotor_is_no_heavier_than_its_links() -> None:
     assert given.joints["j1"].rotor_inertia == 10.0
 
 
-@pytest.mark.parametrize("stiffness", [400, {"j1": 4000, "j2": 300}, 60])
+@pytest.mark.parametrize(
+    "stiffness", [pytest.param(400, marks=pytest.mark.slow), {"j1": 4000, "j2": 300}, 60]
+)
 def test_assumed_joints_come_to_rest_in_the_time_that_poses_settle(stiffness: Any) -> None:
     """Catches damping that fits the lightest link only, and an integrator that lets go for
     seconds."""

@@ -5,6 +5,7 @@ import csv
 import re
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cache
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,7 @@ from elastic_env.core.errors import ConfigurationError
 from tests.cells import METRIC, cell, family, over_seeds
 from train.commands.cli import main
 from train.commands.compare_config import CompareConfig, Sweep
-from train.evaluate.changes import changes
+from train.evaluate.changes import Change, changes
 from train.evaluate.conditions import Condition, PolicySpec
 from train.evaluate.episodes import Evaluation, evaluate
 from train.evaluate.leaderboard_rows import PairedChange, Standing, standings
@@ -87,6 +88,12 @@ def rows() -> list[Standing]:
 _ROWS: list[Standing] = []
 
 
+@cache
+def all_changes() -> list[Change]:
+    """Paired changes of all that was played, which take a while too."""
+    return changes(played(), GROUPS)
+
+
 def _rows() -> list[Standing]:
     found = played()
     return standings(found, GROUPS, {"base": 20.4, "best": 31.0, "learned": 45.2})
@@ -140,13 +147,10 @@ def test_a_score_is_a_mean_of_scenarios_and_of_training_seeds() -> None:
 
 def test_changes_to_the_base_are_those_of_the_statistics() -> None:
     """Catches changes of another scope or motion."""
-    found = played()
     for scope in ("both", "soft"):
         name = ("learned", scope, "3 s", METRIC)
         (own,) = [
-            c
-            for c in changes(found, GROUPS)
-            if (c.policy, c.scope, c.reference, c.column.metric) == name
+            c for c in all_changes() if (c.policy, c.scope, c.reference, c.column.metric) == name
         ]
         assert row("learned", scope).base == PairedChange("base", own.relative, own.verdict)
     assert (row("base", "both").base, row("base", "both").rival) == (None, None)
@@ -245,7 +249,7 @@ def test_all_forms_have_the_same_figures() -> None:
     found = played()
     with run_folder("x", {}, 0) as folder:
         table, text = write_leaderboard(rows(), folder)
-        write_report(Results("x", found, changes(found, GROUPS), folder, standings=rows()))
+        write_report(Results("x", found, all_changes(), folder, standings=rows()))
     again = read_leaderboard(table)
     (mine,), (theirs,) = (
         [s for s in some if (s.policy, s.scope, s.metric) == ("learned", "soft", METRIC)]
@@ -421,54 +425,49 @@ def play_quickly(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return played
 
 
-def test_a_policy_of_ones_own_gets_a_row_by_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches a leaderboard that the command does not write, and a user's policy that is not on
-    it."""
-    Path("mine.py").write_text(
-        "import baselines\n\n\ndef make(env):\n    return baselines.make('uncompensated', env)\n"
-    )
-    own = {"name": "mine.py:make", "track": "walks on this robot"}
-    write_board(["uncompensated", own])
-    play_quickly(monkeypatch)
-    main(["compare", "board.yaml"])
-    folder = Path("runs/board")
-    with (folder / "leaderboard.csv").open(newline="") as file:
-        found = [r for r in csv.DictReader(file) if r["pooled"] == "True" and r["metric"] == METRIC]
-    assert [(r["policy"], r["track"]) for r in found] == [
-        ("uncompensated", "encoders, foot sensors and IMU"),
-        ("mine.py:make", "walks on this robot"),
-    ]
-    assert found[0]["mean"] == found[1]["mean"]
-    with (folder / "episodes.csv").open(newline="") as file:
-        episodes = [float(r[METRIC]) for r in csv.DictReader(file)]
-    assert float(found[0]["mean"]) == pytest.approx(episodes[0], rel=1e-5)
-    assert "**walks on this robot**" in (folder / "leaderboard.md").read_text()
-
-
-def test_a_policy_of_ones_own_stands_beside_published_ones_that_do_not_play(
+def test_a_policy_of_ones_own_gets_a_row_by_one_line(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Catches a leaderboard that is played anew, rows that do not say that they are published,
-    and ones of another version, another protocol or the same name."""
-    Path("mine.py").write_text(
-        "import baselines\n\nmake = lambda env: baselines.make('zero', env)\n"
-    )
-    write_board(["uncompensated"])
+    """Catches a leaderboard that the command does not write, and a user's policy that is not on
+    it.
+
+    Beside published rows also a leaderboard that is played anew, rows that do not say that they
+    are published, and ones of another version, another protocol or the same name.
+    """
+    for name in ("theirs.py", "mine.py"):
+        Path(name).write_text(
+            "import baselines\n\n\ndef make(env):\n    return baselines.make('zero', env)\n"
+        )
+    write_board(["zero", {"name": "theirs.py:make", "track": "walks on this robot"}])
     played = play_quickly(monkeypatch)
     main(["compare", "board.yaml", "--output", "theirs"])
-    published = Path("theirs/leaderboard.csv")
+    folder = Path("theirs")
+    published = folder / "leaderboard.csv"
+    with published.open(newline="") as file:
+        rows = [r for r in csv.DictReader(file) if r["pooled"] == "True" and r["metric"] == METRIC]
+    assert [(r["policy"], r["track"]) for r in rows] == [
+        ("zero", "encoders, foot sensors and IMU"),
+        ("theirs.py:make", "walks on this robot"),
+    ]
+    assert rows[0]["mean"] == rows[1]["mean"]
+    with (folder / "episodes.csv").open(newline="") as file:
+        episodes = [float(r[METRIC]) for r in csv.DictReader(file)]
+    assert float(rows[0]["mean"]) == pytest.approx(episodes[0], rel=1e-5)
+    assert "**walks on this robot**" in (folder / "leaderboard.md").read_text()
+
     words = ["compare", "board.yaml", "--published", str(published)]
     mine = [*words, "--policies", "mine.py:make", "--output", "ours"]
     main(mine)
-    assert played == ["uncompensated", "mine.py:make"]
+    assert played == ["zero", "theirs.py:make", "mine.py:make"]
     found = read_leaderboard(Path("ours/leaderboard.csv"))
     assert {(row.policy, row.is_published) for row in found} == {
-        ("uncompensated", True),
+        ("zero", True),
+        ("theirs.py:make", True),
         ("mine.py:make", False),
     }
     before = read_leaderboard(published)
     assert [row.score for row in found if row.is_published] == [row.score for row in before]
-    assert "uncompensated (published)" in Path("ours/leaderboard.md").read_text()
+    assert "zero (published)" in Path("ours/leaderboard.md").read_text()
 
     def refused(arguments: list[str]) -> str:
         with pytest.raises(SystemExit):
@@ -476,7 +475,7 @@ def test_a_policy_of_ones_own_stands_beside_published_ones_that_do_not_play(
         return " ".join(capsys.readouterr().err.split())
 
     capsys.readouterr()
-    assert "'uncompensated' is published already; name your own by --policies" in refused(words)
+    assert "'zero' is published already; name your own by --policies" in refused(words)
     more = refused([*mine[:-1], "more", "--episodes", "2"])
     assert "published rows and your own must have the same version and protocol" in more
     text = published.read_text()
@@ -484,7 +483,7 @@ def test_a_policy_of_ones_own_stands_beside_published_ones_that_do_not_play(
     assert "got published elastic-env" in refused([*mine[:-1], "other"])
     Path("board.yaml").write_text("name: board\n")
     assert "leaderboard: true" in refused([*mine[:-1], "none"])
-    assert len(played) == 2  # all of it was found before anything played
+    assert len(played) == 3  # all of it was found before anything played
 
 
 def test_a_table_that_is_none_is_refused_in_a_sentence(tmp_path: Path) -> None:

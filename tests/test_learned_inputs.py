@@ -59,8 +59,7 @@ def corrected(env: Any, base: Any, *observe: str, **settings: Any) -> Corrected:
 
 def test_inputs_are_named_groups_that_an_ablation_leaves_out() -> None:
     """Catches an input that cannot be left out alone, and one that takes another's columns."""
-    env = walkers(2)
-    base = baselines.make("foothold", env)
+    env, base, _, _ = walked(2, 1250)
     for left_out in range(len(MEMORY)):
         kept = [name for i, name in enumerate(MEMORY) if i != left_out]
         names = [one.name for one in Features(corrected(env, base, *kept)).signals]
@@ -71,25 +70,25 @@ def test_inputs_are_named_groups_that_an_ablation_leaves_out() -> None:
 
 def test_a_base_without_such_a_memory_says_so() -> None:
     """Catches zeros in the place of what the base does not know."""
-    env = walkers(2)
+    env, _, (shown, *_), _ = walked(2, 1250)
     base = baselines.make("adaptive_posture", env)
     with pytest.raises(ConfigurationError, match=r"'landing'"):
         Features(corrected(env, base, "landing"))
     with pytest.raises(ConfigurationError, match=r"unknown estimate of a policy 'landing'"):
-        base.estimate("landing", env.reset()[0], base.begin(env.reset()[0]))
+        base.estimate("landing", shown, base.begin(shown))
 
 
 def test_what_stood_still_is_the_mean_over_the_first_moments() -> None:
     """Catches a mean over another time, one that goes on in the walk, and a load of the feet
     alone."""
-    env, base, observations, states = walked(3, 60)
+    env, base, observations, states = walked(2, 1250)
     model = env.unwrapped.assumed_model
     feet = FlatFeet(model, LEAST_LOAD * model.biped.weight)
     table = model.observation_table
     wrench = table.group("wrench")
     features = Features(corrected(env, base, "standing"))
     expected = []
-    fresh = np.zeros(3, np.bool_)
+    fresh = np.zeros(2, np.bool_)
     for k in (1, 7, 15, 16, 59):
         rows = np.array(observations[: min(k, 15)])
         errors, loads = [], []
@@ -98,7 +97,7 @@ def test_what_stood_still_is_the_mean_over_the_first_moments() -> None:
             errors.append(np.column_stack([error, shown[:, table.group("imu_attitude")]]))
             loads.append(force[:, :, 2].sum(axis=1) / model.biped.weight - 1.0)
         expected = np.column_stack([np.mean(errors, axis=0), np.mean(loads, axis=0)])
-        memory = features.begin(3)
+        memory = features.begin(2)
         inner = type("State", (), {"inner": states[k]})
         found, _ = features.at(observations[k], memory, fresh, inner, None)
         np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-15)
@@ -157,15 +156,15 @@ def test_the_phase_repeats_with_every_step_and_tells_its_parts_apart() -> None:
 
 def test_the_zmp_error_is_that_of_flat_feet() -> None:
     """Catches an error on level ground, which `contact_error` has, and one of the other sign."""
-    env, base, observations, states = walked(3, 400)
+    env, base, observations, states = walked(2, 1250)
     feet = FlatFeet(
         env.unwrapped.assumed_model, LEAST_LOAD * env.unwrapped.assumed_model.biped.weight
     )
     features = Features(corrected(env, base, "zmp_error"))
     for k in (1, 200, 399):
         inner = type("State", (), {"inner": states[k]})
-        fresh = np.zeros(3, np.bool_)
-        found, _ = features.at(observations[k], features.begin(3), fresh, inner, None)
+        fresh = np.zeros(2, np.bool_)
+        found, _ = features.at(observations[k], features.begin(2), fresh, inner, None)
         np.testing.assert_array_equal(found, feet.zmp_error(observations[k]))
 
 
@@ -204,16 +203,17 @@ def test_inputs_of_many_worlds_are_those_of_each_alone_and_of_the_exported_polic
         "shared": True,
         "decision_period": 25,
     }
-    many = ResidualVectorWrapper(walkers(2), "foothold", **settings)
+    fast = {"step_period": [0.12, 0.28, 0.12]}  # 100 control steps
+    many = ResidualVectorWrapper(walkers(2, **fast), "foothold", **settings)
     shown, _ = many.reset(seed=5)
-    alone = ResidualWrapper(gymnasium.make(WALKER, **QUICK), "foothold", **settings)
+    alone = ResidualWrapper(gymnasium.make(WALKER, **QUICK | fast), "foothold", **settings)
     np.testing.assert_array_equal(shown[1], alone.reset(seed=6)[0])
     network = random_network(many._loop.corrected, 0.5)
-    env = walkers(2)
+    env = walkers(2, **fast)
     played = ResidualPolicy(many._loop.corrected, network)
     observation, _ = env.reset(seed=5)
     state = None
-    for _ in range(33):  # into the third step
+    for _ in range(20):  # into the third step
         decided = network(shown)
         shown, reward, *_ = many.step(decided.astype(np.float32))
         seen, gained, *_ = alone.step(decided[1].astype(np.float32))

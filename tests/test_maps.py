@@ -4,6 +4,7 @@ it."""
 import csv
 import math
 import re
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -202,10 +203,16 @@ FOUR: dict[tuple[float, float], dict[str, list[float | None]]] = {
 }
 
 
+@cache
+def four() -> HeatMap:
+    """The map of these episodes."""
+    return grid(FOUR)
+
+
 def test_a_cell_compares_learning_with_the_best_without_it_there() -> None:
     """Catches axes that are swapped, one rival for all cells, a wrong sign, and falls that make
     a policy the best."""
-    found = grid(FOUR)
+    found = four()
     assert [[c.best for c in row] for row in found.cells] == [["learned", "base"], ["base", None]]
     assert [[c.best_analytic for c in row] for row in found.cells] == [
         ["best", "base"],
@@ -228,7 +235,7 @@ def test_a_cell_compares_learning_with_the_best_without_it_there() -> None:
 
 def test_a_page_has_what_is_ahead_in_a_map_and_what_failed() -> None:
     """Catches a change with the wrong sign, and a cell in which every policy fell."""
-    (found,) = learned_maps(write_maps([grid(FOUR)], Path("map.csv")))
+    (found,) = learned_maps(write_maps([four()], Path("map.csv")))
     assert found.row == [
         "pelvis error",
         "learned",
@@ -301,7 +308,7 @@ def test_a_cell_is_held_out_unless_training_saw_the_same_scenario() -> None:
 def test_panels_say_who_is_best_and_by_how_much_learning_is_ahead() -> None:
     """Catches letters that do not fit the key, green where learning is behind, and stars that
     are missing."""
-    best, learned, *levels = panels(grid(FOUR))
+    best, learned, *levels = panels(four())
     assert [entry[:2] for entry in best.key] == [("A", "base"), ("B", "best"), ("C", "learned")]
     assert [[s.text for s in row] for row in best.squares] == [["C", "A"], ["A", "-"]]
     assert [[s.text for s in row] for row in learned.squares] == [["−50", "+200"], ["−25", "-"]]
@@ -319,7 +326,7 @@ def test_panels_say_who_is_best_and_by_how_much_learning_is_ahead() -> None:
 def test_report_pictures_and_table_of_a_map_agree() -> None:
     """Catches a map that is upside down on the page, a picture that is missing, and a table with
     other figures."""
-    found = grid(FOUR)
+    found = four()
     evaluations = [
         e
         for (k, load), own in FOUR.items()

@@ -179,12 +179,11 @@ def test_the_default_robots_differ_and_are_the_same_at_every_value() -> None:
 def test_causes_are_those_of_every_world_alone() -> None:
     """Catches a robot that cannot stand and ends the others, and a world that is taken for
     another."""
-    values = [("push_n", 0.0), ("stiffness", 0.2), ("push_n", 900.0), ("slope_rad", 0.12)]
+    values = [("push_n", 0.0), ("stiffness", 0.2), ("push_n", 900.0)]
     conditions = [walk(swept={f"scenario.{name}": value}) for name, value in values]
     together = failure_causes(conditions, 1)
-    assert together.tolist() == ["", NO_REST, "fell", NO_REST]
-    alone = [failure_causes([own], 1).item() for own in conditions]
-    assert alone == together.tolist()
+    assert together.tolist() == ["", NO_REST, "fell"]
+    assert failure_causes(conditions[2:3], 1).tolist() == ["fell"]
 
 
 def test_gains_are_stronger_and_nothing_else_changes() -> None:

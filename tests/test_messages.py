@@ -1,7 +1,7 @@
 """Messages: a user's text stays short in them, and what is missing is where they say."""
 
-import difflib
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -40,6 +40,12 @@ def make(**options: Any) -> Any:
     return gymnasium.make("elastic_env/Testbed-v0", disable_env_checker=True, **options)
 
 
+@cache
+def shared_testbed() -> Any:
+    """One for all whose text is not its own."""
+    return make()
+
+
 ENTRIES: list[Callable[[str], Any]] = [
     lambda text: make(scenario=text),
     lambda text: make(reference=text),
@@ -49,9 +55,9 @@ ENTRIES: list[Callable[[str], Any]] = [
     lambda text: make(timestep_s=text),
     lambda text: gymnasium.make("elastic_env/WalkInPlace-v0", step_period=text),
     lambda text: baselines.make(text, SimpleNamespace(unwrapped=None)),
-    lambda text: baselines.make(text, make()),
-    lambda text: baselines.make("input", make(), **{text: 1}),
-    lambda text: make_policy(PolicySpec(name=text), make()),
+    lambda text: baselines.make(text, shared_testbed()),
+    lambda text: baselines.make("input", shared_testbed(), **{text: 1}),
+    lambda text: make_policy(PolicySpec(name=text), shared_testbed()),
     lambda text: gallery_robot(text),
     lambda text: environment(text),
     lambda text: algorithm_class(text),
@@ -74,10 +80,9 @@ ENTRIES: list[Callable[[str], Any]] = [
 ]
 
 
-def longest_quote(message: str, text: str) -> int:
-    """Characters of a text that a message shows in one piece."""
-    matcher = difflib.SequenceMatcher(None, message, text, autojunk=False)
-    return matcher.find_longest_match().size
+def quotes_too_much(message: str, text: str) -> bool:
+    """Whether a message shows more than MOST characters of a text in one piece."""
+    return any(text[i : i + MOST + 1] in message for i in range(len(text) - MOST))
 
 
 @pytest.mark.parametrize("entry", ENTRIES, ids=range(len(ENTRIES)))
@@ -88,8 +93,8 @@ def test_a_users_text_stays_short_in_an_error(entry: Callable[[str], Any]) -> No
             entry(text)
         message = str(caught.value)
         assert len(message) < LONGEST
-        assert longest_quote(message, text[:1000]) <= MOST
-        assert longest_quote(message, text[-1000:]) <= MOST
+        assert not quotes_too_much(message, text[:1000])
+        assert not quotes_too_much(message, text[-1000:])
 
 
 @pytest.mark.parametrize(
@@ -121,7 +126,7 @@ def test_the_command_line_stays_short(
         assert ended.value.code in (2, 3)
         said = capfd.readouterr()
         assert len(said.err) < LONGEST
-        assert longest_quote(said.err, text[:1000]) <= MOST
+        assert not quotes_too_much(said.err, text[:1000])
 
 
 def test_what_is_shown_has_its_begin_and_end() -> None:

@@ -104,7 +104,7 @@ def test_what_a_residual_sees_of_a_mirrored_walk_is_the_mirror_image() -> None:
     differ from each other."""
     env = walker(scenario="spread", num_steps=1)
     model = model_of(env)
-    rows = walked(env)[::20]
+    rows = walked(env)[::40]
     observe = ("observation", "encoder_error", "contact_error", "level", "bending", "base_action")
     features, seen = features_of(env, rows, observe=observe)
     _, reflected = features_of(env, Mirror(model.observation_table.signals)(rows), observe=observe)

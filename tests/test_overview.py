@@ -66,7 +66,7 @@ def test_intervals_stand_beside_the_episodes_of_bars(
     what is not drawn."""
     kept: list[Any] = []
     monkeypatch.setattr(plots, "save", lambda figure, path: kept.append(figure) or path)
-    quick = {"kind": "multisine", "duration_s": 2.0}
+    quick = {"kind": "multisine", "duration_s": 0.5}
     several = evaluate(Condition(policy={"name": "input"}, reference=quick, episodes=4))
     columns = several.condition.environment.judged[:1]
     metric = columns[0].metric

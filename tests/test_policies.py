@@ -32,6 +32,8 @@ VARIANTS: dict[str, tuple[str, dict[str, Any]]] = {
     **{name: (name, {}) for name in NAMES},
     "newton": ("input", {"output": "newton", "gravity": "tree", "ramp_s": 0.1}),
 }
+AT_NIGHT = pytest.param("uncompensated", marks=pytest.mark.slow)
+"""Without memory, as `zero` is."""
 PERIOD_S = 0.004
 AT_ONCE = {"ramp_s": PERIOD_S}
 """Options with which the compensation is there from the first step."""
@@ -89,7 +91,9 @@ def scalar_actions(
     return actions, rewards
 
 
-@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize(
+    "variant", [AT_NIGHT, *(name for name in VARIANTS if name != "uncompensated")]
+)
 def test_vector_actions_are_the_scalar_ones_row_by_row(variant: str) -> None:
     """Catches memory that leaks between worlds or episodes, and formulas that depend on the size
     of the batch."""
@@ -121,7 +125,16 @@ def test_vector_actions_are_the_scalar_ones_row_by_row(variant: str) -> None:
         np.testing.assert_array_equal(np.array(rewards)[:, world], np.array(alone[1]))
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize(
+    "name",
+    [
+        "zero",
+        AT_NIGHT,
+        "input",
+        pytest.param("dynamic", marks=pytest.mark.slow),
+        pytest.param("oracle", marks=pytest.mark.slow),
+    ],
+)
 def test_evaluate_policy_of_sb3_gives_the_return_of_a_plain_loop(name: str) -> None:
     """Catches a signature, a shape or a state that Stable-Baselines3 cannot use, and lost
     episode starts."""

@@ -163,9 +163,9 @@ def test_a_leg_in_the_air_keeps_its_pitch_and_follows_slowly() -> None:
 
 
 def pelvis_error(name: str, scenario: str, **options: Any) -> float:
-    """Pelvis error rms of a walk of two fast steps [rad]."""
+    """Pelvis error rms of a walk of one fast step [rad]."""
     env = gymnasium.make(
-        "elastic_env/WalkInPlace-v0", step_period=1.6, num_steps=2, scenario=scenario
+        "elastic_env/WalkInPlace-v0", step_period=1.6, num_steps=1, scenario=scenario
     )
     policy = baselines.make(name, env, **options)
     observation, info = env.reset(seed=0)

@@ -38,8 +38,8 @@ def sense_links(qpos: Any, qvel: Any, step: Any, links: Any, control: Any) -> No
 @pytest.mark.parametrize(
     ("env", "scenario", "kernels_of_gpu"),
     [
-        (WALKER, "imu", (write_commands, sense_walk)),
-        (TESTBED, "nominal", (sense_links,)),
+        pytest.param(WALKER, "imu", (write_commands, sense_walk), marks=pytest.mark.slow),
+        (TESTBED, "nominal", (write_commands, sense_links)),
     ],
 )
 def test_a_control_step_compiles_to_ptx(

@@ -36,7 +36,13 @@ def _in_a_folder_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.chdir(tmp_path)
 
 
-@pytest.mark.parametrize(("env", "policy"), [("walker", "adaptive_posture"), ("testbed", "input")])
+@pytest.mark.parametrize(
+    ("env", "policy"),
+    [
+        pytest.param("walker", "adaptive_posture", marks=pytest.mark.slow),
+        ("testbed", "input"),
+    ],
+)
 def test_a_policy_plays_against_the_clock(
     env: str, policy: str, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -22,6 +22,7 @@ from elastic_env.world.robot_model import joint_ranges
 from tests.played import metrics_of
 from tests.trees import TREE
 from train.commands.cli import main
+from train.evaluate.environments import environment
 
 JOINTS = {"*": {"stiffness": 800.0}, "wrist": 400.0}
 QUICK = {"kind": "sine", "amplitude": 0.2, "duration_s": 1.0, "onset_s": 0.5}
@@ -323,42 +324,48 @@ def test_compensators_take_the_motion_of_the_end_effector_back() -> None:
     assert compensated["end_effector_error_rms_m"] < 0.05 * without["end_effector_error_rms_m"]
 
 
-def test_the_commands_play_a_robot_from_its_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Catches a command that needs Python for a robot, and paths that hang on the working
-    directory."""
+MOTION = "{kind: sine, amplitude: 0.2, duration_s: 0.3, onset_s: 0.2}"
+
+
+@pytest.fixture
+def mine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    """The file of a robot in a folder below the working directory."""
     monkeypatch.chdir(tmp_path)
     folder = tmp_path / "mine"
     folder.mkdir()
     (folder / "arm.xml").write_text(ARM)
     (folder / "arm.yaml").write_text(EXAMPLE.with_suffix(".yaml").read_text())
     (folder / "arm.robot.yaml").write_text("model: arm.xml\njoints: arm.yaml\nend_effector: tool\n")
-    motion = "{kind: sine, amplitude: 0.2, duration_s: 0.3, onset_s: 0.2}"
-    main(["evaluate", "--env", "mine/arm.robot.yaml", "--policy", "dynamic", "--reference", motion])
-    assert (
-        "end_effector_error_rms_m" in (tmp_path / "runs" / "evaluate" / "episodes.csv").read_text()
-    )
-    (tmp_path / "one.yaml").write_text(
-        f"name: one\nenv: mine/arm.robot.yaml\nreferences: [{motion}]\nscenarios: [ideal]\n"
-        "policies: [input]\n"
-    )
-    main(["compare", "one.yaml", "--jobs", "1"])
-    assert "end effector error" in (tmp_path / "runs" / "one" / "report.html").read_text()
-    (tmp_path / "bench.yaml").write_text(
-        f"cases: [{{env: mine/arm.robot.yaml, policy: input, reference: {motion}, "
-        "figures: {end_effector_error_rms_m: null}}]\n"
-    )
-    main(["bench", "bench.yaml", "--update"])
-    main(["bench", "bench.yaml"])
-    (tmp_path / "no.yaml").write_text("name: no\n")
-    from train.evaluate.environments import environment
+    return "mine/arm.robot.yaml"
 
+
+def test_a_command_plays_a_robot_from_its_file(mine: str) -> None:
+    """Catches a command that needs Python for a robot, and paths that hang on the working
+    directory."""
+    main(["evaluate", "--env", mine, "--policy", "dynamic", "--reference", MOTION])
+    assert "end_effector_error_rms_m" in Path("runs/evaluate/episodes.csv").read_text()
+    Path("no.yaml").write_text("name: no\n")
     with pytest.raises(
         ConfigurationError,
         match=r"no.yaml must be a file of a robot, with the keys model and joints",
     ):
         environment("no.yaml")
+
+
+@pytest.mark.slow
+def test_every_command_plays_a_robot_from_its_file(mine: str, tmp_path: Path) -> None:
+    """Catches a report or a bench that knows the robots of the package alone."""
+    (tmp_path / "one.yaml").write_text(
+        f"name: one\nenv: {mine}\nreferences: [{MOTION}]\nscenarios: [ideal]\npolicies: [input]\n"
+    )
+    main(["compare", "one.yaml", "--jobs", "1"])
+    assert "end effector error" in (tmp_path / "runs" / "one" / "report.html").read_text()
+    (tmp_path / "bench.yaml").write_text(
+        f"cases: [{{env: {mine}, policy: input, reference: {MOTION}, "
+        "figures: {end_effector_error_rms_m: null}}]\n"
+    )
+    main(["bench", "bench.yaml", "--update"])
+    main(["bench", "bench.yaml"])
 
 
 @pytest.mark.slow

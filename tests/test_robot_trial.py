@@ -22,7 +22,7 @@ from elastic_env.robots.robot.environment import EXAMPLE, configure_robot
 from elastic_env.world.joint_task import JointPlant
 from tests.gallery_files import FOLDER
 from train.commands.cli import main
-from train.commands.robot import POLICIES, Robot, robot_arguments, try_robot
+from train.commands.robot import POLICIES, Robot, robot_arguments, try_robot, write_robot
 from train.commands.robot_at_rest import joint_shares, rest_poses
 from train.evaluate.conditions import Condition
 from train.evaluate.environments import environment
@@ -78,9 +78,10 @@ def test_the_table_says_what_was_played(tried: tuple[Path, str]) -> None:
         assert errors[2] < 0.2 * errors[0]
 
 
+@pytest.mark.slow
 def test_the_folder_goes_on_with_other_commands(tried: tuple[Path, str]) -> None:
-    """Catches a file of a robot that names what is not there, and one that describes another
-    robot."""
+    """Catches a file of a robot that names what is not there, and a table, a picture or a report
+    that is not written."""
     folder, _ = tried
     assert {file.name for file in folder.iterdir()} == {
         "config.yaml",
@@ -93,6 +94,19 @@ def test_the_folder_goes_on_with_other_commands(tried: tuple[Path, str]) -> None
         "comparison",
     }
     assert (folder / "comparison" / "report.html").is_file()
+    require_the_same_robot(folder)
+
+
+def test_what_is_written_of_a_robot_is_read_as_the_same(tmp_path: Path) -> None:
+    """Catches a file of a robot that names what is not there, and one that describes another
+    robot."""
+    trial = Robot(model=str(EXAMPLE), stiffness=str(JOINTS), end_effector="tool")
+    assert write_robot(robot_arguments(trial), tmp_path) == tmp_path / "robot.yaml"
+    require_the_same_robot(tmp_path)
+
+
+def require_the_same_robot(folder: Path) -> None:
+    """Check that the robot of a folder is the made-up arm, to `--env` and to `elastic robot`."""
     again = configure_robot(**environment(str(folder / "robot.yaml")).arguments("poses"))
     given = configure_robot(str(EXAMPLE), str(JOINTS), end_effector="tool")
     tried_again = configure_robot(**robot_arguments(Robot(model=str(folder / "robot.yaml"))))

@@ -69,13 +69,19 @@ CASES = {
 }
 
 
+SOME = [
+    pytest.param(name, marks=[pytest.mark.slow] * (name in ("left foot", "without friction")))
+    for name in CASES
+]
+
+
 @cache
 def case(name: str) -> tuple[mujoco.MjModel, Equilibrium, Array]:
     """A case, settled once."""
     return settled(*CASES[name])
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", SOME)
 def test_the_true_plant_stays_where_it_was_settled(name: str) -> None:
     """Catches a rest that is one only with strong dampers or without friction, and a servo that
     must still wind up."""
@@ -83,7 +89,7 @@ def test_the_true_plant_stays_where_it_was_settled(name: str) -> None:
     data = placed(model, rest, command)
     at = JointAddresses.of(model, LEG_JOINTS)
     assert model.tendon_damping.max() == 10.0
-    for _ in range(20):
+    for _ in range(6):
         mujoco.mj_step(model, data, 50)
         for columns in (at.q, at.theta, slice(0, 7)):
             np.testing.assert_allclose(data.qpos[columns], rest.qpos[columns], rtol=0.0, atol=1e-4)
@@ -111,7 +117,7 @@ def forces_on_the_feet(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[Arra
     return force, moment
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", SOME)
 def test_springs_at_rest_carry_the_holding_torque(name: str) -> None:
     """Catches a robot that is placed with undeflected springs, or with those of another
     stiffness."""

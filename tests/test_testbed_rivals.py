@@ -213,8 +213,11 @@ def test_the_imu_is_zeroed_where_the_joint_hangs(middle: float, expected: float)
 @pytest.mark.parametrize(
     "scenario",
     [
-        *("soft", "backlash", "sensor"),
-        *(pytest.param(name, marks=pytest.mark.slow) for name in ("nominal", "stiff", "payload")),
+        "soft+backlash+sensor",
+        *(
+            pytest.param(name, marks=pytest.mark.slow)
+            for name in ("nominal", "soft", "stiff", "payload", "backlash", "sensor")
+        ),
     ],
 )
 def test_the_observer_is_stable_in_every_scenario(scenario: str) -> None:

@@ -117,17 +117,17 @@ def errors(
     return float(metrics["link_error_rms_rad"])
 
 
-STILL = {"kind": "sine", "amplitude": 1e-9, "duration_s": 0.5, "onset_s": 2.0}
-MOVING = {"kind": "sine", "amplitude": 0.4, "frequency_hz": 0.3, "duration_s": 3.0, "onset_s": 1.0}
+STILL = {"kind": "sine", "amplitude": 1e-9, "duration_s": 0.25, "onset_s": 1.0}
+MOVING = {"kind": "sine", "amplitude": 0.4, "frequency_hz": 0.6, "duration_s": 1.5, "onset_s": 0.5}
 
 
 @pytest.mark.parametrize("integral_gain", [0.0, 8000.0])
 def test_at_rest_input_takes_the_sag_away(integral_gain: float) -> None:
     """Catches a compensator that leaves the sag of the servo, or compensates a weight that
     gravcomp carries."""
-    for home in poses(2):
-        sag = errors("uncompensated", "ideal", integral_gain, home, STILL)
-        assert errors("input", "ideal", integral_gain, home, STILL) < 0.01 * sag
+    (home,) = poses(1)
+    sag = errors("uncompensated", "ideal", integral_gain, home, STILL)
+    assert errors("input", "ideal", integral_gain, home, STILL) < 0.01 * sag
 
 
 @pytest.mark.parametrize("integral_gain", [0.0, 8000.0])

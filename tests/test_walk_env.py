@@ -166,7 +166,7 @@ def assert_equal(a: Any, b: Any, path: str = "") -> None:
         assert len(a) == len(b), path
         for i in range(len(a)):
             assert_equal(a[i], b[i], f"{path}[{i}]")
-    else:
+    elif not (isinstance(a, float | str) and a == b):
         np.testing.assert_array_equal(a, b, err_msg=path)
 
 
@@ -633,10 +633,10 @@ def test_random_actions_end_in_falls_with_a_reason_and_never_in_bad_numbers() ->
 @pytest.mark.parametrize(
     "scenario",
     [
-        *("ideal", "payload", "spread", "sensor", "backlash", "slope"),
+        *("ideal", "payload", "sensor", "backlash", "slope"),
         *(
             pytest.param(name, marks=pytest.mark.slow)
-            for name in ("nominal", "soft", "ideal+slope")
+            for name in ("nominal", "soft", "spread", "ideal+slope")
         ),
     ],
 )
@@ -648,7 +648,7 @@ def test_an_episode_starts_in_static_equilibrium(scenario: str) -> None:
     start = env.truth()
     reference = env.task.assumed_model.plan.q
     weight = (MASS_KG + (5.0 if scenario == "payload" else 0.0)) * GRAVITY
-    for k in range(125):
+    for k in range(60):
         assert info["force_left"] + info["force_right"] == pytest.approx(weight, abs=0.02)
         assert vertical_forces(env).sum() == pytest.approx(
             weight - 2 * FOOT_MASS_KG * GRAVITY, abs=0.02
@@ -674,7 +674,12 @@ def vertical_forces(env: ElasticEnv) -> Array:
 
 @pytest.mark.parametrize(
     ("scenario", "factor"),
-    [("ideal", 1.0), ("ideal+soft", 0.7), ("ideal+stiff", 1.3), ("ideal+spread", None)],
+    [
+        ("ideal", 1.0),
+        ("ideal+soft", 0.7),
+        pytest.param("ideal+stiff", 1.3, marks=pytest.mark.slow),
+        ("ideal+spread", None),
+    ],
 )
 def test_at_rest_every_servo_carries_its_spring(scenario: str, factor: float | None) -> None:
     """Catches a true stiffness that is not the one of the physics: B θ̈ = 0 needs a servo torque
@@ -1403,18 +1408,18 @@ def test_weights_of_the_reward_can_be_chosen() -> None:
     np.testing.assert_array_equal(rewards[1]["tilt"], rewards[0]["tilt"])
 
 
-def test_standing_can_be_left_out_of_the_reward_as_it_is_out_of_the_metrics() -> None:
+def test_standing_can_be_left_out_of_the_reward_as_it_is_out_of_the_metrics(
+    open_loop: Recording,
+) -> None:
     """Catches a factor on the walk itself, on other terms, or at other steps than those that the
     metrics leave out."""
-    logs = []
-    for standing in (1.0, 0.25):
-        env = walk_worlds(1, scenario="ideal", reward={"standing": standing})
-        env.reset(seed=0)
-        logs.append(
-            [env.step(np.zeros((1, 12)))[4]["reward_terms"] for _ in range(env.task.num_steps)]
-        )
+    env = walk_env(scenario="ideal", reward={"standing": 0.25})
+    logs = [
+        [result[4]["reward_terms"] for result in open_loop.results[1:]],
+        [env.step(action)[4]["reward_terms"] for action in zeros(NUM_STEPS)],
+    ]
     whole, less = (
-        {name: np.array([terms[name][0] for terms in log]) for name in log[0]} for log in logs
+        {name: np.array([terms[name] for terms in log]) for name in log[0]} for log in logs
     )
     walking = env.task.plan.timing.walking[
         np.arange(1, env.task.num_steps + 1).clip(max=env.task.num_steps)
@@ -1451,7 +1456,7 @@ def test_metrics_of_an_episode_come_once() -> None:
     env.reset(seed=0)
     actions = np.array([np.full(12, 0.3), np.zeros(12)], dtype=np.float32)
     ends = 0
-    for _ in range(NUM_STEPS - 1):
+    for _ in range(250):
         _, _, terminated, truncated, info = env.step(actions)
         done = terminated | truncated
         ends += int(done.sum())
@@ -1460,18 +1465,21 @@ def test_metrics_of_an_episode_come_once() -> None:
     assert ends > 1
 
 
-def test_friction_is_that_of_the_soles() -> None:
-    """Catches the friction of the floor, which MuJoCo takes where it is the larger one."""
-    for options, expected in (
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
         ({}, 1.0),
         ({"robot": {"friction": 0.4}}, 0.4),
-        ({"robot": {"friction": 1.3}}, 1.3),
-    ):
-        env = make_walk(**SHORT, **options)
-        env.reset(seed=0)
-        contact = env.unwrapped.simulation._data.contact
-        assert len(contact) > 0
-        np.testing.assert_array_equal(contact.friction[:, 0], expected)
+        pytest.param({"robot": {"friction": 1.3}}, 1.3, marks=pytest.mark.slow),
+    ],
+)
+def test_friction_is_that_of_the_soles(options: dict[str, Any], expected: float) -> None:
+    """Catches the friction of the floor, which MuJoCo takes where it is the larger one."""
+    env = make_walk(**SHORT, **options)
+    env.reset(seed=0)
+    contact = env.unwrapped.simulation._data.contact
+    assert len(contact) > 0
+    np.testing.assert_array_equal(contact.friction[:, 0], expected)
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])

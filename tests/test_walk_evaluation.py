@@ -1,8 +1,7 @@
 """Evaluating a walk: the error of the local frame against Eq. 1, records, tables, figures,
 sweeps, and the commands."""
 
-from collections.abc import Sequence
-from functools import cache
+from collections.abc import Iterator, Sequence
 from io import StringIO
 from pathlib import Path
 from types import SimpleNamespace
@@ -17,6 +16,8 @@ from PIL import Image
 from rich.console import Console
 
 import train.commands.comparison
+from baselines.policies import RESIDUAL
+from baselines.residual.residual_folder import load_residual
 from baselines.residual_env import ResidualVectorWrapper
 from baselines.walking.controller import LocalFrame, local_frame
 from elastic_env.core.config import load_yaml
@@ -27,7 +28,7 @@ from elastic_env.rigid.leg_kinematics import rotation_x, rotation_y
 from elastic_env.world.robot_model import WalkerModel
 from train.commands.cli import main
 from train.commands.compare_config import CompareConfig
-from train.commands.comparison import _distinct_conditions, try_out
+from train.commands.comparison import try_out
 from train.evaluate.conditions import Condition, PolicySpec
 from train.evaluate.episodes import Evaluation, evaluate
 from train.evaluate.local_frame_error import (
@@ -57,15 +58,10 @@ TWO_STEPS = {"step_period": [0.3, 0.5, 0.3], "num_steps": 2}
 COMMAND_SHORT = "{step_period: [0.3, 0.5, 0.3], num_steps: 1}"
 CONFIGS = sorted((Path(__file__).parents[1] / "configs").glob("*.yaml"))
 TRAININGS = [path for path in CONFIGS if path.stem.startswith("train_")]
-COMPARISONS = [
-    pytest.param(
-        path,
-        id=path.stem,
-        marks=[pytest.mark.slow] * path.stem.startswith(("map_", "footholds")),
-    )
-    for path in CONFIGS
-    if path not in TRAININGS and path.stem != "bench"
-]
+COMPARISONS = [path for path in CONFIGS if path not in TRAININGS and path.stem != "bench"]
+LARGE = ("map_", "footholds")
+"""Beginnings of the names of configurations with very many conditions."""
+SHIPPED = (TRAININGS, [path for path in COMPARISONS if not path.stem.startswith(LARGE)])
 HIP_ROLL = 1
 """Place of the hip roll joint in a leg of six."""
 
@@ -225,9 +221,10 @@ def test_a_rigid_robot_knows_its_frame_and_an_elastic_one_does_not() -> None:
     """Catches an error that is there without elasticity, options of a policy that do not reach
     the environment."""
     rigid = PolicySpec(name="zero", label="rigid", env_options={"form": "rigid"})
+    fast = {"step_period": [0.2, 0.3, 0.2], "num_steps": 2}
     cells = [
-        walk(spec=rigid, reference=TWO_STEPS, scenario="ideal"),
-        walk("input", TWO_STEPS, scenario="ideal"),
+        walk(spec=rigid, reference=fast, scenario="ideal"),
+        walk("input", fast, scenario="ideal"),
     ]
     stiff, elastic = (evaluate(cell, num_threads=1).episodes[0] for cell in cells)
     assert stiff["policy"] == "rigid"
@@ -267,8 +264,11 @@ def test_record_of_a_walk_names_its_cell_and_agrees_with_its_trace() -> None:
 
 def test_the_error_of_the_imu_is_that_of_roll_and_pitch_in_the_walk() -> None:
     """Catches an error against another step's truth, one axis alone, and standing that counts."""
+    fast = {"step_period": [0.2, 0.3, 0.2], "num_steps": 1}
     exact, off = (
-        evaluate(walk("zero", scenario=scenario), num_threads=1).episodes[0]["imu_error_rms_rad"]
+        evaluate(walk("zero", fast, scenario=scenario), num_threads=1).episodes[0][
+            "imu_error_rms_rad"
+        ]
         for scenario in ("ideal", "imu")
     )
     assert exact < 1e-12
@@ -511,43 +511,75 @@ def test_references_are_swept_by_their_step_period() -> None:
 # Configurations and commands.
 
 
-@pytest.mark.parametrize("path", TRAININGS, ids=lambda path: path.stem)
-def test_trainings_that_come_with_it_are_valid(path: Path) -> None:
-    """Catches a scenario, a base or a setting that does not exist, and a scenario that is to be
-    held out."""
-    config = load_yaml(path, TrainConfig)
-    assert config.name == path.stem
-    assert not {"stiff", "push", "slope"} & set(config.scenarios)
-    assert len(config.seeds) >= 5
-    for scenario in config.scenarios:
-        env = make_vector_env(
-            config.condition(scenario, config.base), 2, 1, AutoresetMode.SAME_STEP
-        )
-        assert ResidualVectorWrapper(env, config.base, **config.settings.model_dump()).num_envs == 2
-
-
-@cache
-def new_conditions() -> dict[str, list[Condition]]:
-    """Of every configuration of `COMPARISONS` that is not slow the conditions with an environment
-    or a policy that none before it has: many have the same ones."""
-    paths = [param.values[0] for param in COMPARISONS if not param.marks]
-    named = [(path.stem, c) for path in paths for c in load_yaml(path, CompareConfig).conditions()]
-    names = {id(condition): name for name, condition in named}
-    found: dict[str, list[Condition]] = {path.stem: [] for path in paths}
-    for condition in _distinct_conditions([condition for _, condition in named]):
-        found[names[id(condition)]].append(condition)
-    return found
-
-
-@pytest.mark.parametrize("path", COMPARISONS)
+@pytest.mark.parametrize(
+    ("trainings", "comparisons"),
+    [
+        pytest.param(*SHIPPED, id="one_of_each"),
+        *(
+            pytest.param(
+                *([one] if one in part else [] for part in (TRAININGS, COMPARISONS)),
+                id=one.stem,
+                marks=pytest.mark.slow,
+            )
+            for one in (*TRAININGS, *COMPARISONS)
+        ),
+    ],
+)
 def test_configurations_that_come_with_it_are_valid(
-    path: Path, monkeypatch: pytest.MonkeyPatch
+    trainings: list[Path], comparisons: list[Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Catches a name or a duration that does not exist."""
+    """Catches a name, a duration, a scenario, a base or a setting that does not exist, a residual
+    that is damaged, and a scenario that is to be held out.
+
+    Each of them is made once for all configurations; every night all of them for each
+    configuration, which shows one that does not exist in its environment or at its motion alone.
+    """
     monkeypatch.chdir(Path(__file__).parents[1])  # where the paths of residuals begin
-    config = load_yaml(path, CompareConfig)
-    assert config.name == path.stem
-    try_out(new_conditions().get(path.stem, config.conditions()))
+    of_one = len(trainings) + len(comparisons) == 1
+    made: set[tuple[str, str]] = set()
+    for path in trainings:
+        config = load_yaml(path, TrainConfig)
+        assert config.name == path.stem
+        assert not {"stiff", "push", "slope"} & set(config.scenarios)
+        assert len(config.seeds) >= 5
+        for scenario in config.scenarios:
+            condition = config.condition(scenario, config.base)
+            if of_one or scenario == config.scenarios[0] or (config.env, scenario) not in made:
+                made.add((config.env, scenario))
+                env = make_vector_env(condition, 2, 1, AutoresetMode.SAME_STEP)
+                settings = config.settings.model_dump()
+                assert ResidualVectorWrapper(env, config.base, **settings).num_envs == 2
+    conditions: list[Condition] = []
+    for path in comparisons:
+        compared = load_yaml(path, CompareConfig)
+        assert compared.name == path.stem
+        conditions += compared.conditions()
+    try_out(conditions if of_one else list(one_of_each(conditions)))
+    for name in {c.policy.name for c in conditions if c.policy.name.startswith(RESIDUAL)}:
+        load_residual(Path(name.removeprefix(RESIDUAL)))
+
+
+def one_of_each(conditions: Sequence[Condition]) -> Iterator[Condition]:
+    """Conditions with a motion, a scenario, or a policy that none before has, whatever its
+    training seed. What is made for a motion counts at each motion. Walks have two steps."""
+    seen: set[str] = set()
+    for condition in conditions:
+        policy = condition.policy
+        robot = (condition.env, condition.env_options, policy.env_options)
+        name = policy.name.partition("/seed_")[0]
+        motion = condition.reference
+        if condition.env == "walker":
+            motion = motion if isinstance(motion, dict) else {"step_period": motion}
+            motion = {**motion, "num_steps": 2}
+        made_at = motion if name.startswith((RESIDUAL, "phase_table")) else None
+        keys = {
+            repr((robot, motion)),
+            repr((robot, condition.scenario_played)),
+            repr((robot, name, policy.options, sorted(condition.policy_options), made_at)),
+        }
+        if not keys <= seen:
+            seen |= keys
+            yield condition.replace(reference=motion)
 
 
 def test_a_cell_is_the_same_with_its_default_motion_named() -> None:
@@ -642,6 +674,7 @@ def test_compare_of_walks_writes_tables_and_the_figures_of_the_chosen_policies(
     assert "0/1" in next(line for line in printed.splitlines() if "rigid" in line)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("in_process")
 def test_evaluate_walks(capsys: pytest.CaptureFixture[str]) -> None:
     """Catches a command that knows the testbed alone."""
@@ -650,31 +683,14 @@ def test_evaluate_walks(capsys: pytest.CaptureFixture[str]) -> None:
     assert "input_wrench" in capsys.readouterr().out
 
 
-def test_play_films_a_walk() -> None:
-    """Catches a film of the testbed alone."""
-    main(
-        [
-            "play",
-            "--env",
-            "walker",
-            "--reference",
-            COMMAND_SHORT,
-            "--video",
-            "x.gif",
-            "--max-s",
-            "0.1",
-        ]
-    )
-    with Image.open("x.gif") as film:
-        assert film.info["duration"] == 40
-
-
+@pytest.mark.slow
 def test_play_of_a_fall_keeps_the_film(capsys: pytest.CaptureFixture[str]) -> None:
-    """Catches a film that is lost where it becomes worth seeing."""
+    """Catches a film of the testbed alone, and one that is lost where it becomes worth seeing."""
     arguments = ["--env", "walker", "--policy", f"{__name__}:leaning", "--reference", COMMAND_SHORT]
     main(["play", *arguments, "--video", "x.gif"])
     with Image.open("x.gif") as film:
         assert film.n_frames >= 2
+        assert film.info["duration"] == 40
     printed = capsys.readouterr().out
     assert "fell" in printed
     assert "wrote x.gif" in printed

@@ -111,7 +111,7 @@ def test_a_number_of_steps_that_cannot_be_is_refused(options: dict[str, Any], me
 def test_a_control_step_of_physics_of_2_ms_is_nearly_that_of_1_ms() -> None:
     """Catches a step that is not refined, or counted twice: from the same states of a walk, the
     joints end within 0.3 mrad of each other, and within 2 % of their motion in the mean."""
-    options = {"num_steps": 1, "scenario": "nominal"}
+    options = {"step_period": STEP_S, "num_steps": 1, "scenario": "nominal"}
     fine = make_walk(**options)
     coarse = make_walk(**options, timestep_s=2e-3)
     assert coarse.unwrapped.task.num_substeps * 2 == fine.unwrapped.task.num_substeps == 4
@@ -122,7 +122,7 @@ def test_a_control_step_of_physics_of_2_ms_is_nearly_that_of_1_ms() -> None:
     state = None
     apart = []
     moved = []
-    for _ in range(1250):
+    for _ in range(fine.unwrapped.task.num_steps):
         ours, theirs = (env.unwrapped.simulation for env in (fine, coarse))
         for field in ("qpos", "qvel", "act", "qacc_warmstart"):
             theirs.bind(field)[:] = ours.bind(field)

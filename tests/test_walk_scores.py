@@ -88,7 +88,7 @@ def test_the_zmp_in_the_feet_is_that_of_feet_where_they_are_planned() -> None:
     feet = [model.body(f"{side}_foot").id for side in "lr"]
     sensors = FootSensors(model.body_mass[feet], model.body_ipos[feet], model.opt.gravity)
     moved = 0.0
-    for step in range(1, 450):
+    for step in range(1, 400):
         _, _, ended, _, info = env.step(offsets[step % len(offsets)])
         assert not ended
         R = task.simulation.bind("site_xmat")[:, sites].reshape(1, 2, 3, 3)
@@ -151,8 +151,8 @@ def test_the_reward_has_the_zmp_in_the_feet_and_the_drift_as_terms_of_their_own(
     """Catches a term of the other figure, of squares, without its weight, and one that counts
     where a weight is zero."""
     weights = {"zmp": 0.0, "zmp_in_feet": 150.0, "foot_drift": 40.0, "standing": 0.25}
-    env = make_walk(**FAST, num_steps=2, scenario="soft", reward=weights)
-    plain = make_walk(**FAST, num_steps=2, scenario="soft")
+    env = make_walk(**FAST, num_steps=1, scenario="soft", reward=weights)
+    plain = make_walk(**FAST, num_steps=1, scenario="soft")
     walking = env.unwrapped.task.plan.timing.walking[1:]
     infos, plain_infos = walked(env), walked(plain)
     factor = np.where(walking, 1.0, 0.25)
@@ -203,7 +203,7 @@ def test_a_walk_that_only_settles_is_refused(settling_steps: int) -> None:
 
 def test_blocks_are_the_first_and_the_last_scored_steps() -> None:
     """Catches blocks of another length or of unscored steps, and another last value."""
-    env = make_walk(**FAST, num_steps=7, gait={"settling_steps": 1}, scenario="nominal")
+    env = make_walk(**FAST, num_steps=6, gait={"settling_steps": 1}, scenario="nominal")
     infos = walked(env)
     metrics = infos[-1]["episode_metrics"]
     timing = env.unwrapped.task.plan.timing
@@ -211,7 +211,7 @@ def test_blocks_are_the_first_and_the_last_scored_steps() -> None:
     scored = timing.scored[1:] & ~np.isnan(column(infos, "zmp_x"))
     blocks = {
         "first_steps": scored & (number < 1 + BLOCK_STEPS),
-        "last_steps": scored & (number >= 7 - BLOCK_STEPS),
+        "last_steps": scored & (number >= 6 - BLOCK_STEPS),
     }
     for block, mask in blocks.items():
         for signal, unit in (
@@ -235,7 +235,7 @@ def test_settling_steps_change_no_motion_and_no_reward() -> None:
     for settling_steps in (0, 1):
         env = make_walk(**FAST, num_steps=2, gait={"settling_steps": settling_steps})
         env.reset(seed=3)
-        runs.append([env.step(NO_OFFSET)[:2] for _ in range(500)])
+        runs.append([env.step(NO_OFFSET)[:2] for _ in range(350)])
     for (seen, reward), (other, same) in zip(*runs, strict=True):
         np.testing.assert_array_equal(seen, other)
         assert reward == same
