@@ -33,6 +33,7 @@ from train.runs.progress import announce_compilation
 ROOT = Path(__file__).parents[1]
 KERNELS = (
     "elastic_env.world.control_kernels",
+    "elastic_env.joint.friction",
     "elastic_env.joint.varying_friction",
     "elastic_env.world.metrics",
     "elastic_env.rigid.tree.kernels",

@@ -115,6 +115,9 @@ class FrictionCompensation:
 
     def _total_load(self, torque: Array, speed: Array, memory: FrictionMemory) -> Array:
         """Load with the friction that does not grow with it, (..., n) [N·m]."""
+        load = torque + memory.coulomb
+        if not self.static.any():
+            return load
         excess = dry_friction(
             speed,
             load=torque,
@@ -122,4 +125,4 @@ class FrictionCompensation:
             static=self.static,
             stribeck_speed=self.stribeck_speed,
         )
-        return torque + memory.coulomb + memory.direction * excess
+        return load + memory.direction * excess

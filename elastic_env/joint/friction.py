@@ -10,12 +10,16 @@ C. Canudas de Wit, "A survey of models, analysis tools and compensation methods 
 machines with friction", Automatica 30(7).
 """
 
+from typing import Any
+
 import numpy as np
 
+from elastic_env.core.compiled import compiled, within_compiled
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array, Parameter
 
 
+@within_compiled
 def dry_friction(
     speed: Array,
     load: Array,
@@ -42,15 +46,41 @@ def dry_friction(
     Returns:
         F, (..., n) [N·m]; never negative.
     """
-    steady = coulomb + load_ratio * np.abs(load) + np.zeros_like(speed)
-    if not np.asarray(static).any():
-        return steady
-    width = np.asarray(stribeck_speed)
-    has_width = width > 0.0
-    with np.errstate(over="ignore"):
-        relative = np.abs(speed) / np.where(has_width, width, 1.0)
-        excess = np.where(has_width, np.exp(-np.square(relative)), np.equal(speed, 0.0))
-    return steady + static * excess
+    has_width = stribeck_speed > 0.0
+    # exp(-100²) is 0; squares of larger numbers overflow
+    relative = np.minimum(np.abs(speed) / np.where(has_width, stribeck_speed, 1.0), 100.0)
+    at_rest = np.where(speed == 0.0, 1.0, 0.0)
+    excess = np.where(has_width, np.exp(-(relative * relative)), at_rest)
+    return coulomb + load_ratio * np.abs(load) + static * excess
+
+
+@compiled
+def dry_friction_rows(rows: Array, places: Any, speed: Array, columns: Any, load: Array) -> Array:
+    """Compute `dry_friction` of joints whose parameters differ between worlds.
+
+    Args:
+        rows: Parameters of the worlds, (num_worlds, ...), or of all, (1, ...).
+        places: Places of F₀, c, F_s and ω_s in a row, (4, n).
+        speed: Speeds of the worlds, (num_worlds, ...) [rad/s].
+        columns: Columns of the joints in it, (n,).
+        load: τ_J, (num_worlds, n) [N·m].
+
+    Returns:
+        F, (num_worlds, n) [N·m].
+    """
+    limits = np.empty_like(load)
+    for world in range(len(load)):
+        terms = rows[world % len(rows)]
+        for i in range(len(columns)):
+            limits[world, i] = dry_friction(
+                speed[world, columns[i]],
+                load[world, i],
+                terms[places[0, i]],
+                terms[places[1, i]],
+                terms[places[2, i]],
+                terms[places[3, i]],
+            )
+    return limits
 
 
 def passed_torque(

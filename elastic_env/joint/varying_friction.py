@@ -23,6 +23,7 @@ import numpy as np
 from elastic_env.core.compiled import compiled
 from elastic_env.core.signals import Array
 from elastic_env.joint.elasticity import ElasticJoint
+from elastic_env.joint.friction import dry_friction_rows
 from elastic_env.joint.joint_names import JointAddresses, friction_name, spring_name
 
 _TERMS = 4
@@ -106,9 +107,17 @@ class VaryingFriction:
         if len(self._rigid):
             load[:, self._rigid] = self._rigid_load(field, state)
         if len(self._elastic):
-            springs = [field(f"tendon_{name}") for name in ("stiffness", "damping", "lengthspring")]
-            _set_spring_load(self._elastic, self._springs, *springs, state("qpos"), qvel, load)
-        return _limits(field("numeric_data"), self.numbers, qvel, self.links, load)
+            _set_spring_load(
+                self._elastic,
+                self._springs,
+                field("tendon_stiffness"),
+                field("tendon_damping"),
+                field("tendon_lengthspring"),
+                state("qpos"),
+                qvel,
+                load,
+            )
+        return dry_friction_rows(field("numeric_data"), self.numbers, qvel, self.links, load)
 
     def _rigid_load(self, field: _Fields, state: _Fields) -> Array:
         """τ_J of the joints without a spring, (num_worlds, k) [N·m].
@@ -159,31 +168,3 @@ def _set_spring_load(
             rate = qvel[world, theta_dot] - qvel[world, q_dot]
             damper_torque = damping[world % len(damping), spring] * rate
             load[world, joints[i]] = spring_torque + damper_torque
-
-
-@compiled
-def _limits(data: Array, numbers: Any, qvel: Array, links: Any, load: Array) -> Array:
-    """F of joints under their loads, see `friction.dry_friction`, (num_worlds, n) [N·m].
-
-    Args:
-        data: `numeric_data` of the models, (num_worlds, ...) or (1, ...).
-        numbers: Places of F₀, c, F_s and ω_s in it, (4, n).
-        qvel: Speeds, (num_worlds, nv).
-        links: Degrees of freedom of the links, (n,).
-        load: τ_J, (num_worlds, n) [N·m].
-    """
-    limits = np.empty_like(load)
-    for world in range(len(load)):
-        terms = data[world % len(data)]
-        for i in range(len(links)):
-            speed = qvel[world, links[i]]
-            coulomb = terms[numbers[0, i]]
-            load_ratio = terms[numbers[1, i]]
-            static = terms[numbers[2, i]]
-            stribeck_speed = terms[numbers[3, i]]
-            if stribeck_speed > 0.0:
-                static *= math.exp(-((speed / stribeck_speed) ** 2))
-            elif speed != 0.0:
-                static = 0.0
-            limits[world, i] = coulomb + load_ratio * abs(load[world, i]) + static
-    return limits

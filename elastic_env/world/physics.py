@@ -17,6 +17,7 @@ import numpy as np
 from mujoco import MjData, MjModel, batch
 from typing_extensions import override
 
+from elastic_env.core.compiled import compile_now
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array, BoolArray, IntArray
 from elastic_env.joint.varying_friction import VaryingFriction
@@ -140,6 +141,12 @@ class Worlds(Simulation):
         """Return a field of the models, (num_worlds, ...) or (1, ...)."""
         raise NotImplementedError
 
+    def _find_friction(self) -> None:
+        """Find varying friction, and compile it before a first step that may be in real time."""
+        self._friction = VaryingFriction.of(self.model)
+        if self._friction is not None:
+            compile_now(self._friction.limits, self._field, self.bind)
+
     def _set_friction(self, friction: VaryingFriction) -> None:
         """Set the friction of all worlds from their states."""
         limits = friction.limits(self._field, self.bind)
@@ -185,11 +192,11 @@ class SingleWorld(Worlds):
         self._has_own_model = False
         self._counts = data.warning.number[None]
         self._views = {}
-        self._friction = VaryingFriction.of(model)
         self.qpos = data.qpos[None]
         self.qvel = data.qvel[None]
         self.act = data.act[None]
         self.ctrl = data.ctrl[None]
+        self._find_friction()
 
     def __getstate__(self) -> dict[str, Any]:
         """Return everything except the live views, for `copy.deepcopy` and pickle."""
@@ -250,7 +257,6 @@ class ManyWorlds(Worlds):
         self._varied: set[str] = set()
         self._bound: set[str] = set()
         self._views = {}
-        self._friction = VaryingFriction.of(model)
         threads = min(num_threads or os.cpu_count() or 1, num_worlds)
         self._batch = batch.Batch(model, nsim=num_worlds, nthread=threads)
         self._counts = self._batch.warning[..., 1]
@@ -258,6 +264,7 @@ class ManyWorlds(Worlds):
         self.qvel = self._batch.bind("qvel")
         self.act = self._batch.bind("act")
         self.ctrl = self._batch.bind("ctrl")
+        self._find_friction()
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the state without live views and threads: for copies, pickle, a forked process."""

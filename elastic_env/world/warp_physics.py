@@ -20,7 +20,6 @@ from typing_extensions import override
 
 from elastic_env.core.errors import ConfigurationError, missing_extra, quote
 from elastic_env.core.signals import Array, BoolArray
-from elastic_env.joint.varying_friction import VaryingFriction
 from elastic_env.world.physics import Worlds
 
 try:
@@ -111,7 +110,6 @@ class WarpWorlds(Worlds):
         self._device = _find_device(device or "cuda:0")
         self._warned = set()
         self._views = {}
-        self._friction = VaryingFriction.of(model)
         warnings_known = int(mujoco.mjtWarning.mjNWARNING)
         self._counts = np.zeros((num_worlds, warnings_known), dtype=np.int64)
         self._plant = warp_model(model)
@@ -131,6 +129,7 @@ class WarpWorlds(Worlds):
         self._model.opt.warn_overflow = 0  # `_check_results` warns
         self.qpos, self.qvel, self.act, _ = self.views(_STATE)
         self.ctrl = self.bind("ctrl")
+        self._find_friction()
         self.restart(np.ones(num_worlds, dtype=np.bool_))
 
     def __getstate__(self) -> dict[str, Any]:
