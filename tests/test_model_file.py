@@ -18,7 +18,7 @@ import elastic_env  # noqa: F401  registers the environment
 from baselines import PositionCompensator
 from elastic_env import ElasticJoint, Servo, make_elastic
 from elastic_env.core.errors import ConfigurationError
-from elastic_env.joint.commanded_joints import coupled_fingers
+from elastic_env.joint.default_hinges import coupled_fingers
 from elastic_env.joint.model_file import compiled_model, read_model
 from elastic_env.robots.robot.model import read_robot
 from train.commands.robot import Robot, robot_arguments, write_robot

@@ -16,7 +16,7 @@ from elastic_env.motion.gait import Gait, step_timing
 from elastic_env.robots.thormang.environment import make as make_walk
 from elastic_env.robots.thormang.environment import make_vector as make_walk_vector
 from elastic_env.robots.thormang.model import LEG_JOINTS
-from elastic_env.robots.thormang.tables import BLOCK_STEPS
+from elastic_env.robots.thormang.walk_signals import BLOCK_STEPS
 from elastic_env.world.foot_sensors import FootSensors
 from tests.ground_contact import foot_drift, ground_wrench, zero_moment_point
 

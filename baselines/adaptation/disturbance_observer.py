@@ -47,7 +47,7 @@ from baselines.compensation.dry_friction import presliding_friction
 from baselines.compensation.filters import filter_share
 from baselines.compensation.measured import require_sensor
 from baselines.compensation.policy import PolicyAround, PolicyInputs, Step
-from baselines.compensation.startup import Ramp
+from baselines.compensation.ramp import Ramp
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array, IntArray
 from elastic_env.joint.elasticity import joint_torque

@@ -16,7 +16,7 @@ from typing_extensions import override
 from baselines.adaptation.learned_signals import LearnedSignals
 from baselines.adaptation.learning_law import limit_surprise, update
 from baselines.compensation.policy import MemoryAround, Policy, PolicyAround, PolicyInputs, Step
-from baselines.compensation.startup import Ramp
+from baselines.compensation.ramp import Ramp
 from elastic_env.core.errors import ElasticError
 from elastic_env.core.signals import Array, BoolArray
 from elastic_env.world.robot_model import RobotModel

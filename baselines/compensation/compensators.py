@@ -24,7 +24,7 @@ from baselines.compensation.policy import (
     put_rows,
     select_rows,
 )
-from baselines.compensation.startup import Ramp
+from baselines.compensation.ramp import Ramp
 from elastic_env.core.errors import ConfigurationError, require_known
 from elastic_env.core.signals import Array, IntArray, Parameter
 from elastic_env.joint import elasticity

@@ -13,7 +13,7 @@ from typing_extensions import override
 from baselines.compensation.compensators import Compensated
 from baselines.compensation.dynamic_compensator import DriveMemory, DynamicCompensator
 from baselines.compensation.policy import Motion, PassingMemory, Policy, PolicyInputs, Step
-from baselines.compensation.startup import Ramp
+from baselines.compensation.ramp import Ramp
 from elastic_env.core.errors import ElasticError
 from elastic_env.core.signals import Array, IntArray
 from elastic_env.motion.trajectory import STAND_S

@@ -39,7 +39,7 @@ from baselines.compensation.joint_arguments import (
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.errors import ActionError, ElasticError, quote, require_known
 from elastic_env.core.signals import Array, BoolArray
-from elastic_env.joint.commanded_joints import commanded_hinges
+from elastic_env.joint.default_hinges import commanded_hinges
 from elastic_env.joint.load_continuation import follow_load
 from elastic_env.joint.model_file import GivenModel, compiled_model
 from elastic_env.joint.model_joints import held_positions

@@ -41,7 +41,7 @@ from baselines.compensation.policy import (
     record_row,
     record_rows,
 )
-from baselines.compensation.startup import feedback_ramp
+from baselines.compensation.ramp import feedback_ramp
 from baselines.walking.zmp_shift import (
     Stances,
     center_of_mass_per_pelvis,

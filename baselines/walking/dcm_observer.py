@@ -39,7 +39,7 @@ from baselines.compensation.policy import (
     record_row,
     record_rows,
 )
-from baselines.compensation.startup import feedback_ramp
+from baselines.compensation.ramp import feedback_ramp
 from baselines.walking.flat_feet import LEAST_LOAD, FlatFeet
 from elastic_env.core.compiled import compiled, record_type
 from elastic_env.core.config import Model, quantity

@@ -36,7 +36,7 @@ from baselines.compensation.policy import (
     WalkView,
     record_row,
 )
-from baselines.compensation.startup import Ramp
+from baselines.compensation.ramp import Ramp
 from elastic_env.core.compiled import compiled, compiled_part, record_type
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array

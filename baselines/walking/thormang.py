@@ -55,7 +55,7 @@ import numpy as np
 from typing_extensions import override
 
 from baselines.compensation.policy import BatchPolicy, PassingMemory, PolicyInputs, Step
-from baselines.compensation.startup import Ramp
+from baselines.compensation.ramp import Ramp
 from baselines.walking.zmp_shift import within_reach
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array, IntArray

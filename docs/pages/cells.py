@@ -14,7 +14,7 @@ import numpy as np
 import yaml
 
 from elastic_env.core.errors import ConfigurationError
-from elastic_env.robots.thormang.tables import BLOCKS
+from elastic_env.robots.thormang.walk_signals import BLOCKS
 from train.evaluate.episodes import group_by
 from train.report.markdown import to_markdown
 from train.report.tables import Table

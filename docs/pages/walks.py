@@ -11,7 +11,7 @@ from docs.pages.cells import (
     minus,
     page_table,
 )
-from elastic_env.robots.thormang.tables import BLOCKS
+from elastic_env.robots.thormang.walk_signals import BLOCKS
 from train.evaluate.leaderboard_rows import Standing
 from train.evaluate.margins import margin_table
 

@@ -31,7 +31,7 @@ from elastic_env.world.joint_signals import joint_groups
 from elastic_env.world.metrics import Metric
 from elastic_env.world.physics import DIVERGED_RAD_S
 from elastic_env.world.records import Records, Sample, single_record
-from elastic_env.world.rest_check import RestWatch
+from elastic_env.world.rest_watch import RestWatch
 from elastic_env.world.robot_model import RobotModel
 from elastic_env.world.robot_ranges import draw_robot, draw_robots
 from elastic_env.world.sensors import PendulumImu, is_due

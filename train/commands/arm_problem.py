@@ -16,7 +16,7 @@ from baselines.identification.pose_plan import empty_log
 from baselines.identification.pose_unknowns import PoseUnknowns
 from baselines.identification.static_arm import StaticArm
 from elastic_env.core.errors import unknown_name
-from elastic_env.joint.commanded_joints import commanded_hinges, coupled_fingers
+from elastic_env.joint.default_hinges import commanded_hinges, coupled_fingers
 from elastic_env.joint.model_joints import describe_home, hinges_of
 from elastic_env.world.robot_model import joint_ranges
 from train.commands.identify_options import ArmOptions

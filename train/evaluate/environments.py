@@ -14,7 +14,7 @@ from elastic_env import IDS
 from elastic_env.core.errors import ConfigurationError, quote, unknown_name
 from elastic_env.motion.gait import Gait
 from elastic_env.robots.joint_robot import JointRobot
-from elastic_env.robots.thormang.tables import BLOCK_STEPS
+from elastic_env.robots.thormang.walk_signals import BLOCK_STEPS
 from elastic_env.world.scenario import make_scenario
 from train.evaluate.robot_file import ENDINGS, read_robot_file
 from train.runs.user_code import named_object

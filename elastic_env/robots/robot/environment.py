@@ -13,8 +13,8 @@ from mujoco import MjModel
 
 from elastic_env.core.errors import ConfigurationError, require_known
 from elastic_env.joint import joint_settings, model_joints
-from elastic_env.joint.commanded_joints import without_fingers
 from elastic_env.joint.compile_model import compile_spec
+from elastic_env.joint.default_hinges import without_fingers
 from elastic_env.joint.held_joints import hold_other_joints
 from elastic_env.joint.joint_settings import GivenJoints, JointSettings
 from elastic_env.joint.model_file import GivenModel

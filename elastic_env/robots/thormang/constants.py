@@ -13,7 +13,7 @@ from elastic_env.motion.gait import RIGHT
 from elastic_env.motion.trajectory import STAND_S
 from elastic_env.motion.walk_plan import WalkPlan
 from elastic_env.robots.thormang import config as walk_config
-from elastic_env.robots.thormang import records, tables
+from elastic_env.robots.thormang import records, walk_signals
 from elastic_env.robots.thormang.config import WalkConfig
 from elastic_env.robots.thormang.model import SIDES, biped
 from elastic_env.world import control_kernels as kernels
@@ -101,8 +101,8 @@ def phase_masks(plan: WalkPlan) -> BoolArray:
     touchdown = np.zeros_like(single)
     touchdown[1:] = single[:-1] & ~single[1:]
     gait = plan.gait
-    first = timing.step < gait.settling_steps + tables.BLOCK_STEPS
-    last = timing.step >= gait.num_steps - tables.BLOCK_STEPS
+    first = timing.step < gait.settling_steps + walk_signals.BLOCK_STEPS
+    last = timing.step >= gait.num_steps - walk_signals.BLOCK_STEPS
     phases = (np.ones_like(single), ~single, single, timing.transition)
     masks = timing.scored & np.stack([*phases, first, last, touchdown])
     masks.flags.writeable = False
@@ -119,7 +119,7 @@ def walk_constants(kind: RobotKind, is_inertial: bool) -> Records:
     config = kind.config
     scenario = config.scenario
     noise = np.zeros(1, records.NOISE)
-    for group, deviation in tables.sensor_noise(scenario, is_inertial).items():
+    for group, deviation in walk_signals.sensor_noise(scenario, is_inertial).items():
         noise[group] = deviation
     model = kind.model
     feet = [model.body(f"{side}_foot").id for side in SIDES]

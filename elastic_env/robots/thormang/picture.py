@@ -26,8 +26,8 @@ from elastic_env.robots.thormang import humanoid
 from elastic_env.robots.thormang.humanoid import PLAN, ZMP, ZMP_REFERENCE
 from elastic_env.robots.thormang.model import LEG_JOINTS
 from elastic_env.robots.thormang.records import WalkTruth
-from elastic_env.robots.thormang.tables import FELL
 from elastic_env.robots.thormang.task import WalkTask
+from elastic_env.robots.thormang.walk_signals import FELL
 
 LARGEST_FACTOR = 3.0
 """Factor of the deviations of the pelvis, as far as the legs reach."""

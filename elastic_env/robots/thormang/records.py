@@ -6,7 +6,7 @@ import numpy as np
 
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
-from elastic_env.robots.thormang.tables import GROUPS, MEASURED
+from elastic_env.robots.thormang.walk_signals import GROUPS, MEASURED
 from elastic_env.world.records import COMMON_TRUTH, REAL, WHOLE, floats, record_type
 from elastic_env.world.robot_model import WalkerModel
 

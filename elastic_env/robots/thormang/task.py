@@ -77,7 +77,7 @@ from elastic_env.motion import walk_plan
 from elastic_env.motion.gait import LEFT, RIGHT
 from elastic_env.motion.trajectory import Motion, Plan
 from elastic_env.motion.walk_plan import WalkPlan, plan_walk
-from elastic_env.robots.thormang import NAME, constants, records, tables
+from elastic_env.robots.thormang import NAME, constants, records, walk_signals
 from elastic_env.robots.thormang.config import WalkConfig, placed_robot
 from elastic_env.robots.thormang.constants import TOUCHDOWN, RobotKind
 from elastic_env.robots.thormang.model import biped
@@ -93,7 +93,7 @@ class WalkTask(Task):
 
     config: WalkConfig
     assumed_model: WalkerModel
-    failure_names: tuple[str, ...] = (tables.FELL,)
+    failure_names: tuple[str, ...] = (walk_signals.FELL,)
     world_type = records.WORLD
     noise_type = records.NOISE
 
@@ -116,11 +116,11 @@ class WalkTask(Task):
             model=kinds[0].model,
             assumed=assumed,
             motion=Motion(partial(_joint_plan, plan)),
-            table=tables.OBSERVATION.signals,
+            table=walk_signals.OBSERVATION.signals,
             sensors=config.sensors,
-            joints=tables.JOINTS,
+            joints=walk_signals.JOINTS,
             scenarios=scenarios,
-            metrics=tables.METRICS,
+            metrics=walk_signals.METRICS,
             kinds=[(kind.encoder_counts, late) for kind, late, _ in self._variants],
         )
         table = self.observation_table
@@ -314,7 +314,7 @@ class WalkTask(Task):
         truth = sample.worlds["truth"]
         loaded = ~np.isnan(truth["zmp"][:, 0])
         phases = self._phases[:, self._plan_row(truth)]
-        names = (*tables.PHASES, *tables.BLOCKS)
+        names = (*walk_signals.PHASES, *walk_signals.BLOCKS)
         loaded_names = [f"{name}_loaded" for name in names]
         return {
             **dict(zip(["scored", *names, "touchdown"], phases, strict=True)),

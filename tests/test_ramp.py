@@ -9,7 +9,7 @@ import pytest
 
 import baselines
 import elastic_env  # noqa: F401  registers the environments
-from baselines.compensation.startup import Ramp
+from baselines.compensation.ramp import Ramp
 from elastic_env.core.signals import Array
 from elastic_env.motion.sway import sway_frequencies
 from elastic_env.motion.trajectory import quintic

@@ -7,7 +7,7 @@ import pytest
 
 from elastic_env.core.signals import Array, IntArray
 from elastic_env.world.records import JOINT, Records
-from elastic_env.world.rest_check import RestWatch
+from elastic_env.world.rest_watch import RestWatch
 
 REST = np.array([-1, -1, 0, 0, 0, -1, 1, 1, 1, -1])
 IS_LAST = np.array([False] * 4 + [True] + [False] * 3 + [True, False])
