@@ -47,8 +47,9 @@ def dry_friction(
         F, (..., n) [N·m]; never negative.
     """
     has_width = stribeck_speed > 0.0
-    # exp(-100²) is 0; squares of larger numbers overflow
-    relative = np.minimum(np.abs(speed) / np.where(has_width, stribeck_speed, 1.0), 100.0)
+    width = np.where(has_width, stribeck_speed, 1.0)
+    # exp(-100²) is 0; the squares of larger ratios may overflow
+    relative = np.minimum(np.abs(speed), 100.0 * width) / width
     at_rest = np.where(speed == 0.0, 1.0, 0.0)
     excess = np.where(has_width, np.exp(-(relative * relative)), at_rest)
     return coulomb + load_ratio * np.abs(load) + static * excess
