@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 
 from elastic_env.core.compiled import compiled, within_compiled
-from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array, Parameter
 
 
@@ -107,21 +106,3 @@ def passed_torque(
     """
     needed = torque + direction * friction
     return needed / (1.0 - direction * load_ratio * np.sign(needed))
-
-
-class FrictionTerms(Model):
-    """Terms of `dry_friction` that change with load or speed."""
-
-    load_friction: float = quantity("1", 0.0, ge=0, lt=1)
-    """c, share of the torque passed that is lost to dry friction, see `dry_friction` [1]."""
-    static_friction: float = quantity("N·m", 0.0, ge=0)
-    """F_s, excess of dry friction at rest over that in motion [N·m]."""
-    stribeck_speed: float = quantity("rad/s", 0.0, ge=0)
-    """ω_s, speed at which that excess is down to 37 %; required with `static_friction` [rad/s]."""
-
-    def _check(self) -> None:
-        if self.static_friction > 0.0 and self.stribeck_speed == 0.0:
-            raise ValueError(
-                f"static_friction = {self.static_friction:g} N·m needs a stribeck_speed above 0"
-                " [rad/s], by which it falls to 37 %; 0.05 rad/s is usual for gears"
-            )
