@@ -17,7 +17,8 @@ from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
-from baselines.compensation.policy import Policy, put_rows, select_rows
+from baselines.compensation.memory_rows import put_rows, select_rows
+from baselines.compensation.policy import Policy
 from baselines.policies import make
 from baselines.residual.correction import Corrected
 from baselines.residual.features import Features, FeaturesMemory
@@ -25,8 +26,8 @@ from baselines.residual.settings import ResidualSettings
 from baselines.residual.true_robot import CriticView, truth_of
 from elastic_env.core.errors import ActionError, ConfigurationError, quote
 from elastic_env.core.signals import Array, BoolArray
-from elastic_env.world.envs import final_of, reset_mask
 from elastic_env.world.task import Transition
+from elastic_env.world.vector_env import final_of, reset_mask
 
 
 class _DecisionLoop:

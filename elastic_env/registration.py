@@ -14,8 +14,9 @@ from gymnasium.vector import AutoresetMode
 from elastic_env.core.config import ModelT
 from elastic_env.core.errors import ConfigurationError, quote, require_known
 from elastic_env.rendering.picture import Picture
-from elastic_env.world.envs import ElasticEnv, ElasticVectorEnv
+from elastic_env.world.env import ElasticEnv
 from elastic_env.world.task import Task
+from elastic_env.world.vector_env import ElasticVectorEnv
 
 BACKENDS = ("mujoco", "warp")
 """Engines that step the physics of a vector environment."""

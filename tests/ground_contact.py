@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from elastic_env.core.signals import Array
-from elastic_env.world import control_kernels as kernels
+from elastic_env.world import walk_kernels as kernels
 from elastic_env.world.foot_sensors import FootSensors
 
 

@@ -22,13 +22,13 @@ TARGET = "sm_80"
 _CAPABILITY = (8, 0)
 
 
-def ptx_of(kernel: Any, kinds: tuple[Any, ...], using: ModuleType) -> str:
+def ptx_of(kernel: Any, kinds: tuple[Any, ...], *using: ModuleType) -> str:
     """Assembly of a kernel.
 
     Args:
         kernel: Python function without a result.
         kinds: Numba's types of its arguments.
-        using: Module that it calls. Meanwhile its `np` has what a device has of NumPy, no more.
+        using: Modules that it calls. Meanwhile their `np` has what a device has of NumPy, no more.
     """
     llvm.initialize_all_targets()
     llvm.initialize_all_asmprinters()
@@ -42,10 +42,11 @@ def ptx_of(kernel: Any, kinds: tuple[Any, ...], using: ModuleType) -> str:
         patch.setattr(nvvm, "NVVM", lambda: compiler_of_nvidia)
         patch.setattr(dispatcher, "get_current_device", lambda: device)
         patch.setattr(dispatcher.CUDADispatcher, "get_call_template", _call_template)
-        patch.setattr(using, "np", _numpy_on_a_device())
-        for name, part in vars(using).copy().items():
-            if hasattr(part, "kernel"):  # CUDA's target looks for Numba's own object
-                patch.setattr(using, name, part.kernel)
+        for module_used in using:
+            patch.setattr(module_used, "np", _numpy_on_a_device())
+            for name, part in vars(module_used).copy().items():
+                if hasattr(part, "kernel"):  # CUDA's target looks for Numba's own object
+                    patch.setattr(module_used, name, part.kernel)
         found = compile_cuda(kernel, types.void, kinds, cc=_CAPABILITY)
         place = (code.co_filename, code.co_firstlineno)
         library, _ = found.target_context.prepare_cuda_kernel(

@@ -27,12 +27,13 @@ from rich.console import Console
 import elastic_env  # noqa: F401  registers the environments
 from elastic_env.core import compiled as module
 from elastic_env.core.compiled import compile_now, compiled
-from elastic_env.world import control_kernels as kernels
+from elastic_env.world import joint_kernels, walk_kernels
 from train.runs.progress import announce_compilation
 
 ROOT = Path(__file__).parents[1]
 KERNELS = (
-    "elastic_env.world.control_kernels",
+    "elastic_env.world.joint_kernels",
+    "elastic_env.world.walk_kernels",
     "elastic_env.joint.friction",
     "elastic_env.joint.varying_friction",
     "elastic_env.world.metrics",
@@ -67,13 +68,12 @@ def decorated(tree: ast.Module, *decorators: str) -> list[ast.FunctionDef]:
 
 
 @pytest.mark.parametrize("name", KERNELS)
-def test_a_kernel_calls_functions_of_its_own_file_alone(name: str) -> None:
-    """Catches code that Numba keeps although what it calls, or a constant that it uses, has
-    changed in another file."""
+def test_a_kernel_uses_only_kernels_and_types_of_other_files(name: str) -> None:
+    """Catches code that Numba keeps although a constant in another file has changed."""
     module = importlib.import_module(name)
     tree = ast.parse(Path(str(module.__file__)).read_text())
     imported = {
-        alias.asname or alias.name
+        alias.asname or alias.name: str(node.module)
         for node in tree.body
         if isinstance(node, ast.ImportFrom)
         and str(node.module).startswith(("elastic_env", "baselines", "train"))
@@ -82,13 +82,39 @@ def test_a_kernel_calls_functions_of_its_own_file_alone(name: str) -> None:
     compiled_ones = decorated(tree)
     assert compiled_ones
     for function in compiled_ones:
-        used = {
-            node.id
-            for part in function.body
-            for node in ast.walk(part)
-            if isinstance(node, ast.Name)
-        }
-        assert not used & imported, function.name
+        nodes = [node for part in function.body for node in ast.walk(part)]
+        used = {node.id for node in nodes if isinstance(node, ast.Name)}
+        for other in used & imported.keys():
+            assert imported[other] in KERNELS, (function.name, other)
+            assert callable(getattr(module, other)), (function.name, other)
+
+
+CHAIN = {
+    "chain_first": "FACTOR = 2.0\n\n@{kind}\ndef first(value):\n    return {factor} * value\n",
+    "chain_second": "from chain_first import first\n\n@{kind}\ndef second(value):\n"
+    "    return first(value) + 1.0\n",
+    "chain_third": "from chain_second import second\n\n@compiled\ndef third(value):\n"
+    "    return second(value)\n",
+}
+
+
+@pytest.mark.parametrize("kind", ["compiled", "compiled_part", "within_compiled"])
+def test_a_kernel_compiles_anew_where_a_file_that_it_calls_has_changed(
+    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches code that Numba keeps although what it calls has changed in another file."""
+    monkeypatch.syspath_prepend(tmp_path)
+    for factor in ("2.0", "3.0", "2.0"):
+        for name, text in CHAIN.items():
+            monkeypatch.delitem(sys.modules, name, raising=False)
+            decorators = f"from elastic_env.core.compiled import compiled, {kind} as {kind}\n"
+            text = decorators + text.format(kind=kind, factor=factor)
+            (tmp_path / f"{name}.py").write_text(text)
+        importlib.invalidate_caches()
+        third = importlib.import_module("chain_third").third
+        assert third(5.0) == float(factor) * 5.0 + 1.0
+    for name in CHAIN:
+        sys.modules.pop(name)
 
 
 def test_every_compiled_function_is_looked_at() -> None:
@@ -255,8 +281,8 @@ def test_a_testbed_compiles_nothing_once_it_is_made(monkeypatch: pytest.MonkeyPa
     used: list[Any] = []
     names = ("write_commands", "begin_links", "sense_links", "observe_all_joints")
     for name in names:
-        used.append(compiled(getattr(kernels, name).py_func))
-        monkeypatch.setattr(kernels, name, used[-1])
+        used.append(compiled(getattr(joint_kernels, name).py_func))
+        monkeypatch.setattr(joint_kernels, name, used[-1])
     env = gymnasium.make("elastic_env/Testbed-v0", disable_env_checker=True)
     assert [len(function.signatures) for function in used] == [1] * len(used)
     env.reset(seed=0)
@@ -302,8 +328,8 @@ def test_a_compiled_control_step_does_what_its_python_code_says(
             interpreted = copy.deepcopy(arguments)
             found = ran(*arguments)
             with pytest.MonkeyPatch.context() as uncompiled:
-                for name, function in compiled_ones.items():
-                    uncompiled.setattr(kernels, name, function.py_func)
+                for file, name, function in compiled_ones:
+                    uncompiled.setattr(file, name, function.py_func)
                 assert ran.py_func(*interpreted) == found
             for mine, expected in zip(_arrays(arguments), _arrays(interpreted), strict=True):
                 np.testing.assert_allclose(mine, expected, rtol=1e-13, atol=1e-13)
@@ -312,11 +338,14 @@ def test_a_compiled_control_step_does_what_its_python_code_says(
 
         return both
 
-    compiled_ones = {
-        name: function for name, function in vars(kernels).items() if hasattr(function, "py_func")
-    }
-    for name in ("write_commands", "sense_walk"):
-        monkeypatch.setattr(kernels, name, compared(compiled_ones[name]))
+    compiled_ones = [
+        (file, name, function)
+        for file in (joint_kernels, walk_kernels)
+        for name, function in vars(file).items()
+        if hasattr(function, "py_func")
+    ]
+    for file, name in ((joint_kernels, "write_commands"), (walk_kernels, "sense_walk")):
+        monkeypatch.setattr(file, name, compared(getattr(file, name)))
     for k in range(20):
         worlds.step(np.full((2, 12), 0.01 * np.sin(k), dtype=np.float32))
     assert steps == 40

@@ -26,9 +26,9 @@ from elastic_env.rigid.leg_kinematics import foot_pose
 from elastic_env.robots.thormang.config import WalkConfig
 from elastic_env.robots.thormang.model import ANKLE_HEIGHT_M, LEG, LEG_JOINTS
 from elastic_env.robots.thormang.task import WalkTask
-from elastic_env.world.control_kernels import attitude_from_vertical
 from elastic_env.world.robot_model import WalkerModel
 from elastic_env.world.scenario import make_scenario
+from elastic_env.world.walk_kernels import attitude_from_vertical
 from tests.trees import pendulum
 
 WEIGHT_N = 57.0 * 9.81

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 import baselines
-from baselines.compensation.policy import PolicyInputs, record_row
+from baselines.compensation.compiled_rows import record_row
+from baselines.compensation.inputs import PolicyInputs
 from baselines.walking.dcm_observer import (
     OBSERVED,
     DcmObserver,

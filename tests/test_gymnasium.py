@@ -12,7 +12,8 @@ from stable_baselines3.common.env_checker import check_env as check_sb3_env
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
 from baselines import ResidualVectorWrapper, ResidualWrapper
-from elastic_env.world.envs import ElasticEnv, ElasticVectorEnv
+from elastic_env.world.env import ElasticEnv
+from elastic_env.world.vector_env import ElasticVectorEnv
 
 SIMULATIONS = {
     "elastic_env/Testbed-v0": {

@@ -14,7 +14,7 @@ from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
 from elastic_env.robots.thormang.environment import make_vector
 from elastic_env.robots.thormang.records import TRUTH
-from elastic_env.world import control_kernels as kernels
+from elastic_env.world import walk_kernels as kernels
 from elastic_env.world.scenario import make_scenario
 from elastic_env.world.sensors import AttitudeSensor, InertialSensor
 from tests.three_joints import ARM

@@ -9,7 +9,7 @@ import pytest
 from gymnasium.vector import AutoresetMode
 
 import baselines
-from baselines.compensation.policy import select_rows
+from baselines.compensation.memory_rows import select_rows
 from baselines.residual.correction import Corrected
 from baselines.residual.features import Features
 from baselines.residual.residual_policy import ResidualPolicy

@@ -19,7 +19,8 @@ import baselines
 import elastic_env  # noqa: F401  registers the environments
 from baselines.catalogue import ON_JOINTS, ON_THE_WALKER
 from baselines.compensation.compensators import GravityCompensator
-from baselines.compensation.policy import Zero, select_rows
+from baselines.compensation.memory_rows import select_rows
+from baselines.compensation.policy import Zero
 from baselines.walking.controller import WalkingGains
 from elastic_env.core.errors import ConfigurationError, ElasticError
 from elastic_env.core.signals import Array

@@ -14,7 +14,7 @@ from elastic_env.joint.elasticity import ElasticJoint, Servo
 from elastic_env.joint.make_elastic import transform_hinges
 from elastic_env.joint.motor import Motor
 from elastic_env.motion.trajectory import minimum_jerk
-from elastic_env.world.physics import SingleWorld
+from elastic_env.world.worlds import SingleWorld
 
 LOAD_NM = 0.4905
 K = 40.0

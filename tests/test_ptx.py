@@ -14,7 +14,7 @@ import pytest
 from numba.cuda import libdevicefuncs
 
 import elastic_env  # noqa: F401  registers the environments
-from elastic_env.world import control_kernels as kernels
+from elastic_env.world import joint_kernels, walk_kernels
 from tests.ptx import TARGET, ptx_of
 
 WALKER = "elastic_env/WalkInPlace-v0"
@@ -24,15 +24,15 @@ cuda: Any = importlib.import_module("numba.cuda")
 
 def write_commands(step: Any, action: Any, bound: Any, is_clipped: Any, inputs: Any) -> None:
     worlds = (cuda.grid(1), cuda.gridsize(1))
-    kernels.write_commands(step, action, bound, is_clipped, inputs, *worlds)
+    joint_kernels.write_commands(step, action, bound, is_clipped, inputs, *worlds)
 
 
 def sense_walk(physics: Any, step: Any, walker: Any, control: Any) -> None:
-    kernels.sense_walk(physics, step, walker, control, cuda.grid(1), cuda.gridsize(1))
+    walk_kernels.sense_walk(physics, step, walker, control, cuda.grid(1), cuda.gridsize(1))
 
 
 def sense_links(qpos: Any, qvel: Any, step: Any, links: Any, control: Any) -> None:
-    kernels.sense_links(qpos, qvel, step, links, control, cuda.grid(1), cuda.gridsize(1))
+    joint_kernels.sense_links(qpos, qvel, step, links, control, cuda.grid(1), cuda.gridsize(1))
 
 
 @pytest.mark.parametrize(
@@ -53,13 +53,14 @@ def test_a_control_step_compiles_to_ptx(
     worlds.reset(seed=0)
     arguments: dict[str, Any] = {}
     for kernel in kernels_of_gpu:
-        on_cpu = getattr(kernels, kernel.__name__)
+        file = walk_kernels if kernel is sense_walk else joint_kernels
+        on_cpu = getattr(file, kernel.__name__)
 
         def call(*given: Any, name: str = kernel.__name__, on_cpu: Any = on_cpu) -> Any:
             arguments[name] = given
             return on_cpu(*given)
 
-        monkeypatch.setattr(kernels, kernel.__name__, call)
+        monkeypatch.setattr(file, kernel.__name__, call)
     worlds.step(0.0 * worlds.action_space.sample())
     monkeypatch.undo()
     for kernel in kernels_of_gpu:
@@ -67,7 +68,7 @@ def test_a_control_step_compiles_to_ptx(
         records = [value.dtype for value in _arrays(given) if value.dtype.names]
         assert records
         assert all(kind.isalignedstruct for kind in records)
-        ptx = ptx_of(kernel, tuple(map(numba.typeof, given[:-2])), kernels)
+        ptx = ptx_of(kernel, tuple(map(numba.typeof, given[:-2])), joint_kernels, walk_kernels)
         assert f".target {TARGET}" in ptx
         assert len(re.findall(r"^\.visible \.entry", ptx, re.MULTILINE)) == 1
         missing = set(re.findall(r"^\.extern \.func .*?(\w+)$", ptx, re.MULTILINE))

@@ -11,7 +11,7 @@ import pytest
 
 import baselines
 import elastic_env  # noqa: F401  registers the environments
-from baselines.compensation.policy import NO_INPUTS
+from baselines.compensation.inputs import NO_INPUTS
 from baselines.identification.servo_file import is_servo_log
 from baselines.identification.servo_log import read_servo_log
 from elastic_env.core.config import quantity

@@ -19,7 +19,7 @@ from elastic_env.joint.elasticity import ElasticJoint
 from elastic_env.motion.arm_references import Poses
 from elastic_env.robots.gallery import GALLERY, gallery_file, gallery_joints, gallery_robot
 from elastic_env.robots.robot.environment import EXAMPLE, configure_robot
-from elastic_env.world.joint_task import JointPlant
+from elastic_env.world.joint_plant import JointPlant
 from tests.gallery_files import FOLDER
 from train.commands.cli import main
 from train.commands.robot import POLICIES, Robot, robot_arguments, try_robot, write_robot

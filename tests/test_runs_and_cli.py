@@ -37,7 +37,7 @@ from baselines.identification.identify import Identification
 from elastic_env.core.config import load_yaml
 from elastic_env.core.errors import ConfigurationError, ResultsExistError
 from elastic_env.core.signals import Array
-from elastic_env.world.joint_task import METRICS_OF_ONE as METRICS
+from elastic_env.world.link_signals import METRICS_OF_ONE as METRICS
 from tests.test_identification import synthetic
 from train.commands.cli import main
 from train.commands.compare_config import CompareConfig

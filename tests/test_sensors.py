@@ -9,14 +9,8 @@ from hypothesis import strategies as st
 
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
-from elastic_env.world.sensors import (
-    AttitudeSensor,
-    NoiseStream,
-    angle_of_count,
-    attitude,
-    is_due,
-    quantise,
-)
+from elastic_env.world.noise_stream import NoiseStream
+from elastic_env.world.sensors import AttitudeSensor, angle_of_count, attitude, is_due, quantise
 
 COUNTS = 501_923
 ONE = np.dtype([("a", np.float64)])

@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 
 from elastic_env.core.signals import Array
-from elastic_env.world.physics import ManyWorlds, Simulation, SingleWorld, simulate
+from elastic_env.world.many_worlds import ManyWorlds, simulate
+from elastic_env.world.physics import Simulation
+from elastic_env.world.worlds import SingleWorld
 
 # A cart with an elastic pendulum whose ball bounces on the floor; the servo has an integrator, so
 # there is an `act`.

@@ -17,8 +17,8 @@ from elastic_env.joint.small_servos import SMALL_SERVOS, small_servo
 from elastic_env.robots.robot.environment import configure_robot
 from elastic_env.robots.testbed.config import TestbedConfig
 from elastic_env.robots.testbed.model import Pendulum
-from elastic_env.world.physics import SingleWorld
 from elastic_env.world.robot_model import RobotModel
+from elastic_env.world.worlds import SingleWorld
 from tests.test_varying_friction import rigid_spec
 
 SHEETS = {

@@ -11,7 +11,7 @@ from baselines import PositionCompensator
 from elastic_env.core.errors import ElasticError
 from elastic_env.core.signals import Array
 from elastic_env.robots.robot.environment import configure_robot
-from elastic_env.world.joint_task import JointPlant
+from elastic_env.world.joint_plant import JointPlant
 
 WEIGHT_NM = 0.4905
 K = 40.0

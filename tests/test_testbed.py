@@ -26,8 +26,9 @@ from elastic_env.robots.testbed.config import TestbedConfig
 from elastic_env.robots.testbed.environment import make as make_testbed
 from elastic_env.robots.testbed.environment import make_vector as make_testbed_vector
 from elastic_env.robots.testbed.model import Pendulum
-from elastic_env.world.envs import ElasticEnv, ElasticVectorEnv
+from elastic_env.world.env import ElasticEnv
 from elastic_env.world.scenario import make_scenario, scenario_names
+from elastic_env.world.vector_env import ElasticVectorEnv
 from tests.docstrings import documented_tables
 
 ID = "elastic_env/Testbed-v0"

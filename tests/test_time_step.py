@@ -206,7 +206,7 @@ FULL = """<mujoco><size memory="20K"/><worldbody><geom type="plane" size="1 1 1"
 
 def test_a_full_arena_is_said_once_and_is_no_divergence() -> None:
     """Catches an episode that ends as diverged although its state is finite."""
-    from elastic_env.world.physics import SingleWorld
+    from elastic_env.world.worlds import SingleWorld
 
     bodies = "".join(
         f'<body pos="{0.05 * i} 0 .02"><freejoint/><geom size=".03"/></body>' for i in range(12)

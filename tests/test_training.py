@@ -29,7 +29,7 @@ from baselines.residual_env import ResidualVectorWrapper
 from elastic_env.core.errors import ConfigurationError, ElasticError
 from elastic_env.core.signals import Array
 from elastic_env.robots.thormang.config import BANK_SIZE
-from elastic_env.world.envs import ElasticVectorEnv
+from elastic_env.world.vector_env import ElasticVectorEnv
 from train.commands.bench import BenchCase
 from train.commands.cli import main
 from train.evaluate.episodes import evaluate

@@ -20,9 +20,10 @@ from elastic_env.joint.model_servo import position_servo
 from elastic_env.joint.motor import Motor, terminal_speed
 from elastic_env.joint.varying_friction import VaryingFriction
 from elastic_env.world.drawn_robot import set_joints
-from elastic_env.world.physics import ManyWorlds, SingleWorld, simulate
+from elastic_env.world.many_worlds import ManyWorlds, simulate
 from elastic_env.world.robot_ranges import RobotRanges, draw_robot
 from elastic_env.world.scenario import Scenario
+from elastic_env.world.worlds import SingleWorld
 
 MOTOR = Motor(torque_constant=0.4, back_emf=0.5, resistance=3.0, voltage=5.0, pwm_limit=0.9)
 SERVO = Servo(position_gain=20.0, velocity_gain=0.2, torque_limit=2.0, speed_limit=9.0)

@@ -25,9 +25,10 @@ from elastic_env.robots.thormang import task as walk_in_place
 from elastic_env.robots.thormang.config import BANK_SIZE, WalkConfig, WalkRewardWeights, robot_bank
 from elastic_env.robots.thormang.environment import make as make_walk
 from elastic_env.robots.thormang.environment import make_vector as make_walk_vector
-from elastic_env.world.control_kernels import distance_penalty, tilt_penalty
-from elastic_env.world.envs import ElasticEnv, ElasticVectorEnv
+from elastic_env.world.env import ElasticEnv
 from elastic_env.world.scenario import make_scenario
+from elastic_env.world.vector_env import ElasticVectorEnv
+from elastic_env.world.walk_kernels import distance_penalty, tilt_penalty
 from tests.docstrings import documented_tables
 
 ID = "elastic_env/WalkInPlace-v0"

@@ -20,7 +20,8 @@ from elastic_env.core.errors import ConfigurationError, MissingExtraError
 from elastic_env.core.signals import Array
 from elastic_env.joint.make_elastic import transform_hinges
 from elastic_env.joint.small_servos import small_servo
-from elastic_env.world.physics import ManyWorlds, Simulation
+from elastic_env.world.many_worlds import ManyWorlds
+from elastic_env.world.physics import Simulation
 from train.commands.speed import Speed, measure
 
 TESTBED = "elastic_env/Testbed-v0"

@@ -45,8 +45,10 @@ from typing_extensions import override
 from baselines.compensation.compensators import GravityCompensator
 from baselines.compensation.dry_friction import presliding_friction
 from baselines.compensation.filters import filter_share
+from baselines.compensation.inputs import PolicyInputs
 from baselines.compensation.measured import require_sensor
-from baselines.compensation.policy import PolicyAround, PolicyInputs, Step
+from baselines.compensation.policy import Step
+from baselines.compensation.policy_around import PolicyAround
 from baselines.compensation.ramp import Ramp
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array, IntArray

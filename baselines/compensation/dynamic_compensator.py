@@ -12,10 +12,11 @@ from baselines.compensation.compensators import (
     OutputMethod,
     shallow_copy,
 )
+from baselines.compensation.compiled_rows import record_rows
 from baselines.compensation.contact_torque import PlannedTorque
 from baselines.compensation.dry_friction import FrictionCompensation, FrictionMemory
 from baselines.compensation.gravity_torque import GravityMethod, make_gravity
-from baselines.compensation.policy import Motion, record_rows
+from baselines.compensation.policy import Motion
 from elastic_env.core.compiled import compiled, compiled_part
 from elastic_env.core.signals import Array, Parameter
 from elastic_env.joint.elasticity import static_deflection

@@ -1,4 +1,4 @@
-"""Policies: their protocol, the base classes of ours, and policies of users.
+"""Policies: their protocol, and the base class of ours.
 
 Policies take observations of one world, (m,), or of many, (num_worlds, m). A policy with memory
 keeps it in `state`, one row per world: pass the returned state back, and `episode_start` where
@@ -10,21 +10,18 @@ row per world; the memory of the policy inside it is one of its fields.
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
-from functools import cache
+from collections.abc import Mapping
 from typing import Any, NamedTuple, Protocol, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 from typing_extensions import override
 
-from elastic_env.core.compiled import record_type
+from baselines.compensation.inputs import NO_INPUTS, ONE_WORLD, PolicyInputs
+from baselines.compensation.memory_rows import put_rows, select_rows
 from elastic_env.core.errors import ElasticError, unknown_name
-from elastic_env.core.signals import Array, BoolArray, IntArray, Signal, SignalTable
+from elastic_env.core.signals import Array, BoolArray, IntArray, Signal
 from elastic_env.world.robot_model import RobotModel
-
-Records: TypeAlias = npt.NDArray[Any]
-"""Array of a structured type, one row per world."""
 
 
 class Motion(NamedTuple):
@@ -109,47 +106,6 @@ class ObservationView:
         return is_at_rest & (is_reference | (command == 0.0).all(axis=1))
 
 
-_WALK_FIELDS: Mapping[str, tuple[int, ...]] = {
-    "encoder_angle": (12,),
-    "encoder_rate": (12,),
-    "imu_attitude": (2,),
-    "imu_rate": (3,),
-    "wrench": (2, 2, 3),
-    "reference_angle": (12,),
-    "reference_rate": (12,),
-    "clock": (3,),
-    "load_share": (),
-    "zmp_reference": (2,),
-}
-"""Groups of a walker's observation, and the shapes of their fields; wrench: feet, force and
-moment, axes.
-"""
-
-
-class WalkView:
-    """Observations of a walker as rows with named fields, as compiled kernels read them.
-
-    Args:
-        table: Columns of the observation.
-    """
-
-    def __init__(self, table: SignalTable) -> None:
-        groups = [table.group(name) for name in _WALK_FIELDS]
-        layout = {
-            "names": list(_WALK_FIELDS),
-            "formats": [(np.float64, shape) for shape in _WALK_FIELDS.values()],
-            "offsets": [8 * group.start for group in groups],
-            # without the columns behind them, so that one kernel fits all walkers
-            "itemsize": 8 * max(group.stop for group in groups),
-        }
-        self._type = np.dtype((np.record, layout))
-
-    def fields(self, rows: Array) -> Records:
-        """Observations, (num_worlds, m), as rows with fields, (num_worlds,), in the same memory."""
-        rows = np.ascontiguousarray(rows)
-        return np.ndarray(len(rows), self._type, rows, 0, rows.strides[:1])
-
-
 Action = npt.NDArray[np.float32]
 Step: TypeAlias = tuple[Array, Any]
 """Offsets of the joints, (num_worlds, n) [rad], and the memory after a control step."""
@@ -167,42 +123,6 @@ class Policy(Protocol):
     ) -> tuple[Any, Any]:
         """Action and new state for an observation."""
         ...
-
-
-class PolicyInputs(NamedTuple):
-    """Values of a policy's inputs, (num_worlds, columns) each; None for an input without a value.
-
-    A policy uses its own inputs and passes the others on. `baselines.compensation.inputs` describes
-    them. `command` is no field: it is added to the command of any policy. `load` is no input: it is
-    the mean excess load μ within `deflection`, (num_worlds, 1) [1]. The last two fields are
-    arguments of `predict`, for policies of users.
-    """
-
-    deflection: Array | None = None
-    load: Array | None = None
-    zmp: Array | None = None
-    com: Array | None = None
-    leg_length: Array | None = None
-    hip: Array | None = None
-    posture_gain: Array | None = None
-    balance_gain: Array | None = None
-    is_single: bool = False
-    deterministic: bool = True
-
-    @property
-    def zmp_shift(self) -> Array | None:
-        """Shift of the planned ZMP, (num_worlds, 2) [m]; None without.
-
-        A constant shift of the center of mass shifts the ZMP too.
-        """
-        if self.zmp is None or self.com is None:
-            return self.com if self.zmp is None else self.zmp
-        return self.zmp + self.com
-
-
-NO_INPUTS = PolicyInputs()
-ONE_WORLD = PolicyInputs(is_single=True)
-"""Empty inputs, for many worlds and for one."""
 
 
 class BatchPolicy(ABC):
@@ -299,63 +219,6 @@ class BatchPolicy(ABC):
         return self.view.theta(rows)
 
 
-class MemoryAround(NamedTuple):
-    """Memory of a policy around another one: its own rows, (num_worlds, ...), and the other's."""
-
-    own: Any
-    inner: Any
-
-
-class PolicyAround(BatchPolicy):
-    """A policy around another one, whose memory is the field `inner` of its memory.
-
-    Args:
-        policy: Any policy.
-        model: Assumed robot.
-
-    Attributes:
-        memory_type: Type of the rows of a `MemoryAround`, which are zero at the start; a policy
-            with other memory overrides `begin`.
-    """
-
-    memory_type: Any
-
-    def __init__(self, policy: Any, model: RobotModel) -> None:
-        super().__init__(model)
-        self.policy = as_batch_policy(policy, model)
-        self.inputs = self.policy.inputs
-        self.estimates = self.policy.estimates
-
-    @override
-    def begin(self, rows: Array) -> Any:
-        own = np.zeros(len(rows), self.memory_type)
-        return MemoryAround(own, self.policy.begin(rows))
-
-    def inner_memory(self, memory: Any) -> Any:
-        """Memory of the policy inside."""
-        return memory.inner
-
-    @override
-    def estimate(self, name: str, rows: Array, memory: Any) -> Array:
-        return self.policy.estimate(name, rows, self.inner_memory(memory))
-
-    @override
-    def link_angles(self, rows: Array, memory: Any) -> Array:
-        return self.policy.link_angles(rows, self.inner_memory(memory))
-
-
-class PassingMemory(PolicyAround):
-    """A policy around another one whose memory is the other's, as it has none itself."""
-
-    @override
-    def begin(self, rows: Array) -> Any:
-        return self.policy.begin(rows)
-
-    @override
-    def inner_memory(self, memory: Any) -> Any:
-        return memory
-
-
 class Zero(BatchPolicy):
     """Commands the reference itself: no offset and no memory."""
 
@@ -370,77 +233,9 @@ class Zero(BatchPolicy):
         return np.zeros((len(rows), self.view.num_joints), dtype=np.float32), None
 
 
-class UserMemory(NamedTuple):
-    """Memory of a policy of a user.
-
-    Attributes:
-        has_begun: Worlds whose episode has begun before, (num_worlds,).
-        state: Its state in a list of one. The policy itself resets it where `episode_start` is
-            true.
-    """
-
-    has_begun: BoolArray
-    state: list[Any]
-
-
-class UserPolicy(BatchPolicy):
-    """A policy of a user as one of ours; it gets observations of the shape that the caller gave."""
-
-    def __init__(self, policy: Any, model: RobotModel) -> None:
-        super().__init__(model)
-        self._policy = policy
-        self.reads_rates = getattr(policy, "reads_rates", True)
-
-    @override
-    def begin(self, rows: Array) -> UserMemory:
-        return UserMemory(np.zeros(len(rows), dtype=np.bool_), [None])
-
-    @override
-    def act(self, rows: Array, memory: UserMemory, inputs: PolicyInputs) -> Step:
-        obs = rows[0] if inputs.is_single else rows
-        start = ~memory.has_begun
-        state = memory.state[0]
-        action, state = self._policy.predict(obs, state, start, inputs.deterministic)
-        offset = np.atleast_2d(np.asarray(action, dtype=np.float64))
-        return offset, UserMemory(np.ones(len(rows), dtype=np.bool_), [state])
-
-    @override
-    def link_angles(self, rows: Array, memory: UserMemory) -> Array:
-        return self._policy.link_estimate(rows, memory.state[0])
-
-
-def as_batch_policy(policy: Any, model: RobotModel) -> BatchPolicy:
-    """The policy itself if it is a `BatchPolicy`, else a `UserPolicy` around it."""
-    return policy if isinstance(policy, BatchPolicy) else UserPolicy(policy, model)
-
-
 def as_action(offsets: Array, is_single: bool) -> Action:
     """Offsets in single precision: all rows, or the only row for an observation of one world."""
     return (offsets[0] if is_single else offsets).astype(np.float32, copy=False)
-
-
-def record_rows(**fields: Any) -> Any:
-    """Rows with named fields for compiled kernels, such as a plan, (rows,).
-
-    Args:
-        **fields: Values of each field, (rows, ...).
-    """
-    shapes = [(name, np.shape(values)[1:]) for name, values in fields.items()]
-    rows = np.empty(len(next(iter(fields.values()))), _row_type(*shapes))
-    for name, values in fields.items():
-        rows[name] = values
-    return rows
-
-
-@cache
-def _row_type(*shapes: tuple[str, tuple[int, ...]]) -> np.dtype[Any]:
-    """Type of rows, the same object for equal fields: Numba compares others at every call."""
-    return record_type(**dict(shapes))
-
-
-def record_row(**fields: Any) -> Any:
-    """One row of constants for compiled kernels, (1,), by field."""
-    return record_rows(**{name: [value] for name, value in fields.items()})
 
 
 def resume_memory(policy: Any, rows: Array, state: Any, episode_start: Any) -> Any:
@@ -474,32 +269,3 @@ def count_rows(memory: Any) -> int:
     while not isinstance(memory, np.ndarray):
         memory = memory[0]
     return len(memory)
-
-
-def put_rows(memory: Any, worlds: BoolArray, rows: Any) -> Any:
-    """Memory with other rows in some worlds, a (num_worlds,) mask.
-
-    Values that are neither array nor tuple stay.
-    """
-
-    def replace(array: Array, other: Array) -> Array:
-        result = array.copy()
-        result[worlds] = other
-        return result
-
-    return _map_arrays(replace, memory, rows)
-
-
-def select_rows(memory: Any, worlds: BoolArray) -> Any:
-    """Memory of some worlds, a (num_worlds,) mask."""
-    return _map_arrays(lambda array: array[worlds], memory)
-
-
-def _map_arrays(function: Callable[..., Array], memory: Any, *others: Any) -> Any:
-    """Apply a function to the arrays of memories of the same form."""
-    if isinstance(memory, np.ndarray):
-        return function(memory, *others)
-    if not isinstance(memory, tuple):
-        return memory
-    parts = [_map_arrays(function, *part) for part in zip(memory, *others, strict=True)]
-    return type(memory)(*parts) if hasattr(memory, "_fields") else tuple(parts)

@@ -28,7 +28,6 @@ from scipy.linalg import get_lapack_funcs
 
 from baselines.compensation.command_warnings import CommandWarnings
 from baselines.compensation.dry_friction import FrictionCompensation
-from baselines.compensation.gravity_torque import largest_gravity_torque
 from baselines.compensation.joint_arguments import (
     PerJoint,
     make_friction,
@@ -36,6 +35,7 @@ from baselines.compensation.joint_arguments import (
     read_stiffness,
     servo_gains,
 )
+from baselines.compensation.largest_torque import largest_gravity_torque
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.errors import ActionError, ElasticError, quote, require_known
 from elastic_env.core.signals import Array, BoolArray

@@ -23,7 +23,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from baselines.compensation.policy import ObservationView, put_rows, select_rows
+from baselines.compensation.memory_rows import put_rows, select_rows
+from baselines.compensation.policy import ObservationView
 from baselines.estimation.ground_level import GroundLevel, GroundMemory
 from baselines.estimation.model_error import BendingObserver
 from baselines.residual.correction import Corrected

@@ -29,16 +29,11 @@ from typing import Any
 import numpy as np
 from typing_extensions import override
 
+from baselines.compensation.compiled_rows import WalkView, record_row, record_rows
 from baselines.compensation.filters import filter_share
-from baselines.compensation.policy import (
-    MemoryAround,
-    PolicyAround,
-    PolicyInputs,
-    Step,
-    WalkView,
-    record_row,
-    record_rows,
-)
+from baselines.compensation.inputs import PolicyInputs
+from baselines.compensation.policy import Step
+from baselines.compensation.policy_around import MemoryAround, PolicyAround
 from baselines.compensation.ramp import feedback_ramp
 from baselines.walking.flat_feet import LEAST_LOAD, FlatFeet
 from elastic_env.core.compiled import compiled, record_type

@@ -28,15 +28,10 @@ from typing import Any
 import numpy as np
 from typing_extensions import override
 
-from baselines.compensation.policy import (
-    MemoryAround,
-    PolicyAround,
-    PolicyInputs,
-    Step,
-    WalkView,
-    record_row,
-    record_rows,
-)
+from baselines.compensation.compiled_rows import WalkView, record_row, record_rows
+from baselines.compensation.inputs import PolicyInputs
+from baselines.compensation.policy import Step
+from baselines.compensation.policy_around import MemoryAround, PolicyAround
 from baselines.walking.zmp_offset import IN_PLANE
 from baselines.walking.zmp_shift import Stances, move_feet
 from elastic_env.core.compiled import compiled, compiled_part, record_type

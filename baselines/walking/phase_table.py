@@ -20,7 +20,9 @@ import numpy as np
 from pydantic import Field
 from typing_extensions import override
 
-from baselines.compensation.policy import PassingMemory, PolicyInputs, Step
+from baselines.compensation.inputs import PolicyInputs
+from baselines.compensation.policy import Step
+from baselines.compensation.policy_around import PassingMemory
 from elastic_env.core.config import Model, Title, load_json, quantity
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array

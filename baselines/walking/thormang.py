@@ -54,7 +54,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from typing_extensions import override
 
-from baselines.compensation.policy import BatchPolicy, PassingMemory, PolicyInputs, Step
+from baselines.compensation.inputs import PolicyInputs
+from baselines.compensation.policy import BatchPolicy, Step
+from baselines.compensation.policy_around import PassingMemory
 from baselines.compensation.ramp import Ramp
 from baselines.walking.zmp_shift import within_reach
 from elastic_env.core.config import Model, quantity

@@ -28,8 +28,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy import linalg
 
+from baselines.compensation.compiled_rows import record_row, record_rows
 from baselines.compensation.contact_torque import cosine_and_sine
-from baselines.compensation.policy import record_row, record_rows
 from elastic_env.core.compiled import compiled, compiled_part
 from elastic_env.core.signals import Array
 from elastic_env.rigid.leg_kinematics import LegGeometry, turn

@@ -3,19 +3,22 @@
 NumPy takes longer, as each of its operations has a fixed cost on small arrays.
 
 Numba compiles a kernel at its first call with arrays of a type. It caches the code beside the
-source file or in the user's cache folder, by the file of the called function. So a kernel is in one
-file with all that it calls, and takes sizes from types, not from constants of other files; a test
-checks this. Sums run in the written order, and Numba fuses no operations. So the result of a row
-does not depend on the number of rows.
+source file or in the user's cache folder. Numba compiles again when the file of the called function
+has changed; `_compile` adds the files of the kernels that this file imports. A kernel takes sizes
+from types, not from constants of other files; a test checks this. Sums run in the written order,
+and Numba fuses no operations. So the result of a row does not depend on the number of rows.
 
 The logger `elastic_env.core.compiled` reports at level INFO that a kernel is compiled; it does not
 report one that is loaded. So a program can show why its first use takes long.
 """
 
+import hashlib
+import inspect
 import logging
+import sys
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from functools import cached_property
+from functools import cached_property, update_wrapper
 from typing import Any, Generic, ParamSpec, TypeVar
 
 import numba
@@ -32,6 +35,8 @@ _ONCE = "once after an installation or an update: the first use takes some secon
 _ALWAYS = "for some seconds in every program: there is no folder to keep it that can be written"
 _notes: dict[Any, str] = {}
 """How often a function is compiled, by its Python code."""
+_imports: dict[str, set[str]] = {}
+"""Modules with kernels, and those of them whose kernels they import."""
 
 
 def compiled(function: Callable[_P, _R]) -> Callable[_P, _R]:
@@ -52,17 +57,40 @@ def _compile(function: Callable[_P, _R], **options: Any) -> Any:
     # division by zero gives infinity or nan, as in NumPy; no entry for C saves compile time
     options |= {"error_model": "numpy", "no_cfunc_wrapper": True}
     _notes[function] = _ONCE
+    name = function.__qualname__
+    function.__qualname__ += _digest_of_imports(function)  # is in the name of Numba's cache file
     try:
         return numba.njit(cache=True, **options)(function)
     except RuntimeError:  # no folder is writable: every program compiles again
         _notes[function] = _ALWAYS
         return numba.njit(**options)(function)
+    finally:
+        function.__qualname__ = name
+
+
+def _digest_of_imports(function: Callable[..., Any]) -> str:
+    """Digest of all files with kernels that the function may call, except its own; "" for none."""
+    modules = sorted(_imported_modules(function))
+    if not modules:
+        return ""
+    sources = [inspect.getsource(sys.modules[name]) for name in modules]
+    return "-" + hashlib.sha256("".join(sources).encode()).hexdigest()[:16]
+
+
+def _imported_modules(function: Callable[..., Any]) -> set[str]:
+    """Modules whose kernels the function's module imports; they are recorded with theirs."""
+    own = function.__module__
+    names = {getattr(value, "__module__", own) for value in function.__globals__.values()}
+    direct = (names & _imports.keys()) - {own}
+    _imports[own] = direct.union(*(_imports[name] for name in direct))
+    return _imports[own]
 
 
 class _Part(Generic[_P, _R]):
     """A function for compiled callers; the first call from Python compiles an entry."""
 
     def __init__(self, kernel: Any) -> None:
+        update_wrapper(self, kernel.py_func)
         self.py_func = kernel.py_func
         self.kernel = kernel
         self._numba_type_ = types.Dispatcher(kernel)  # Numba calls it as its dispatcher
@@ -104,6 +132,7 @@ def record_type(**fields: Any) -> np.dtype[Any]:
 
 def within_compiled(function: Callable[_P, _R]) -> Callable[_P, _R]:
     """Decorate a formula that kernels compile, and that Python calls on NumPy arrays as it is."""
+    _imported_modules(function)
     return register_jitable(error_model="numpy")(function)
 
 

@@ -36,8 +36,9 @@ from elastic_env.robots import feasible_reference
 from elastic_env.world import robot_model
 from elastic_env.world.further_sensors import ACCELEROMETER, add_accelerometer
 from elastic_env.world.joint_config import FRICTIONS, JointConfig, RewardWeights
+from elastic_env.world.joint_plant import JointPlant
 from elastic_env.world.joint_signals import ACTION_BOUND_RAD
-from elastic_env.world.joint_task import JointPlant, JointTask
+from elastic_env.world.joint_task import JointTask
 from elastic_env.world.robot_model import RobotModel, joint_ranges
 from elastic_env.world.scenario import Scenario, make_scenario
 

@@ -6,7 +6,7 @@
 | `joint_torque` | a joint each | N·m | torque of spring and damper on the link | noise 0.2, offset up to 0.5 |
 | `accelerometer` | x, y, z | m/s² | specific force at the IMU, acceleration minus gravity | noise 0.0112 |
 
-`link_imu` of a fixed robot of one joint is declared in `elastic_env.world.joint_task`.
+`link_imu` of a fixed robot of one joint is declared in `elastic_env.world.link_signals`.
 
 The accelerometer has the noise of the 3DM-GX4-25, 1.0e-3 m/s²/√Hz (thormang3_imu_3dm_gx4, calib),
 at half the control rate of 250 Hz. Noise and offset of the torque sensor are assumed: 0.2 and 0.5 %
@@ -23,8 +23,9 @@ from elastic_env.core.episode_random import EpisodeRandom
 from elastic_env.core.errors import require_known
 from elastic_env.core.signals import Array, BoolArray, SignalGroup, SignalTable
 from elastic_env.world.joint_signals import Mirrors
+from elastic_env.world.noise_stream import NoiseStream
 from elastic_env.world.scenario import Scenario
-from elastic_env.world.sensors import NoiseStream, angle_of_count, quantise
+from elastic_env.world.sensors import angle_of_count, quantise
 
 
 @dataclass(frozen=True)

@@ -1,126 +1,43 @@
 """A task of n elastic joints: the links follow a reference while the joints bend under gravity.
 
 The observation contains the encoders, the reference of the coming control period, the last command,
-and the requested sensors; the action is the command offset of every joint. The signals of one joint
-have plain names, those of several joints are `name.<joint>`. With several joints `info` has figures
-of all joints together under the plain names: rms of the link errors, deflections, servo errors and
-rates of the offsets, and the largest joint torque.
+and the requested sensors; the action is the command offset of every joint. Signals and metrics are
+those of `elastic_env.world.link_signals`.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
-import mujoco
 import numpy as np
 
 from elastic_env.core.episode_random import EpisodeRandom
 from elastic_env.core.errors import ConfigurationError
-from elastic_env.core.files import read_rows
-from elastic_env.core.signals import Array, BoolArray, Parameter, Signal, Signals
-from elastic_env.joint.elasticity import static_link_angle
+from elastic_env.core.signals import Array, BoolArray, Signals
 from elastic_env.joint.time_step import require_stable
-from elastic_env.motion.trajectory import Motion, PlanTable
-from elastic_env.rigid.tree.end_effector import EndEffector
-from elastic_env.world import control_kernels as kernels
+from elastic_env.motion.trajectory import PlanTable
 from elastic_env.world import drawn_robot, records
+from elastic_env.world import joint_kernels as kernels
 from elastic_env.world.further_sensors import SensorInputs
 from elastic_env.world.joint_config import JointConfig
+from elastic_env.world.joint_plant import JointPlant
 from elastic_env.world.joint_signals import joint_groups
-from elastic_env.world.metrics import Metric
+from elastic_env.world.link_signals import (
+    LINK_IMU,
+    LINK_IMU_SENSOR,
+    METRICS_OF_ONE,
+    METRICS_OF_SEVERAL,
+    METRICS_OF_TOOL,
+    link_signals,
+)
+from elastic_env.world.pendulum_imu import make_pendulum_imu
 from elastic_env.world.physics import DIVERGED_RAD_S
 from elastic_env.world.records import Records, Sample, single_record
 from elastic_env.world.rest_watch import RestWatch
 from elastic_env.world.robot_model import RobotModel
 from elastic_env.world.robot_ranges import draw_robot, draw_robots
-from elastic_env.world.sensors import PendulumImu, is_due
-from elastic_env.world.task import Task, spring_torque
-
-LINK_IMU = Signal("link_angle_imu", "rad", "IMU on the link", kind="measured")
-LINK_IMU_SENSOR = "link_imu"
-"""Its name in `sensors=[...]`, on a robot of one joint; its errors are the errors of the
-scenario's IMU.
-"""
-
-_RIGID_NM_PER_RAD = 1e15
-"""Finite stiffness of a joint without a spring, on a robot whose other servos give way."""
-
-_METRIC_ROWS = read_rows(Path(__file__).with_name("joint_metrics.csv"))
-
-
-def _metrics_for(robots: str) -> tuple[Metric, ...]:
-    rows = [dict[str, Any](row) for row in _METRIC_ROWS]
-    return tuple(Metric(**row) for row in rows if row.pop("robots") == robots)
-
-
-METRICS_OF_ONE = _metrics_for("one")
-METRICS_OF_SEVERAL = _metrics_for("several")
-METRICS_OF_TOOL = _metrics_for("end_effector")
-
-
-@dataclass(frozen=True)
-class JointPlant:
-    """The plant, and the robot as it is assumed and as it really is.
-
-    Attributes:
-        name: Name of the robot.
-        model: Compiled model with elastic joints.
-        assumed, true: Robot as a compensator may know it, and true robot; both without a table of
-            observations.
-        form: "rigid" for a robot without springs.
-        static_torque: τ_g that holds the true links, from (..., n) [rad] to (..., n) [N·m].
-        torque_gradient: ∂τ_g/∂q, from (..., n) to (..., n, n) [N·m/rad].
-        motion: Reference motion of all joints.
-        imu_arm_m: Distance of the link's IMU from the only joint [m]; the joint's axis is
-            horizontal, and its link hangs at q = 0. None for a robot without such an IMU.
-        end_effector: End effector whose place and tilt are scored; None to score joints only.
-    """
-
-    name: str
-    model: mujoco.MjModel
-    assumed: RobotModel
-    true: RobotModel
-    form: str
-    static_torque: Callable[[Array], Array]
-    torque_gradient: Callable[[Array], Array]
-    motion: Motion
-    imu_arm_m: float | None = None
-    end_effector: EndEffector | None = None
-
-    @property
-    def joint_names(self) -> list[str]:
-        """Names of the joints, in order."""
-        return self.true.joint_names
-
-    def rest_angle(
-        self, command: Array, factor: Parameter = 1.0, backlash: Array | None = None
-    ) -> Array:
-        """Link angles at rest without friction.
-
-        The load pulls a link to one side of its dead band. A link that hangs at q = 0 stays there
-        within its dead band.
-
-        Args:
-            command: Commands of the servos, (..., n) [rad].
-            factor: Factor on K, one number or (..., n) [1].
-            backlash: Dead bands, (..., n) [rad]; None for the true joints' dead bands.
-
-        Returns:
-            (..., n) [rad].
-        """
-        stiffness = self.true.rest_stiffness(self.form, factor)
-        if np.isinf(stiffness).all():
-            return command
-        band = self.true.backlash if backlash is None else backlash
-        half = np.sign(self.static_torque(command)) * band / 2.0
-        engaged = command - half
-        if self.imu_arm_m is not None:
-            engaged = np.where(np.abs(command) > np.abs(half), engaged, 0.0)
-        finite = np.minimum(stiffness, _RIGID_NM_PER_RAD)
-        return static_link_angle(
-            engaged, finite, self.static_torque, self.torque_gradient, unique=False
-        )
+from elastic_env.world.sensors import is_due
+from elastic_env.world.task import Task
 
 
 @dataclass(frozen=True)
@@ -199,7 +116,7 @@ class JointTask(Task):
         lag_s = plant.true.servo_lag
         self._has_rest_windows = bool((self._reference.rest >= 0).any())
         self._rest_watch = RestWatch(plant.static_torque, stiffness, joints, lag_s)
-        self._imu = _inertial_imu(config, plant, num_worlds)
+        self._imu = make_pendulum_imu(config, plant, num_worlds)
         self._imu_bias = np.zeros(num_worlds)
         columns = self.observation_table.names
         self._imu_column = columns.index(LINK_IMU.name) if observe_imu else -1
@@ -330,49 +247,13 @@ class JointTask(Task):
         return self._schedule, constants, self._imu_bias, self._imu_column, angle
 
     def _signals(self, joints: Records, worlds: Records) -> Signals:
-        q_ref = joints["q_ref"]
-        q = joints["q"]
-        joint_signals = {
-            "reference_angle": q_ref,
-            "link_angle": q,
-            "link_error": q_ref - q,
-            "deflection": joints["theta"] - q,
-            "joint_torque": spring_torque(joints),
-            "servo_error": joints["command"] - joints["homing"] - joints["theta"],
-            "command_rate": joints["command_rate"],
-        }
-        if len(self._joint_names) == 1:
-            imu = worlds["measured"]["visible_imu"]
-            signals = {name: rows[:, 0].copy() for name, rows in joint_signals.items()}
-            signals["link_angle_imu"] = imu.copy()
-            signals["link_error_imu"] = q_ref[:, 0] - imu
-        else:
-            signals = self._signals_of_several(joint_signals)
+        signals = link_signals(joints, worlds, self._joint_names)
         if self._plant.end_effector is not None:
-            distance, tilt = self._plant.end_effector.errors(q_ref, q)
+            distance, tilt = self._plant.end_effector.errors(joints["q_ref"], joints["q"])
             signals |= {"end_effector_error": distance, "end_effector_tilt": tilt}
         truth = worlds["truth"]
         time_s = truth["step"] * self.config.control_period_s
         return {"time_s": time_s, **signals, "rest": truth["rest"].copy()}
-
-    def _signals_of_several(self, joint_signals: dict[str, Array]) -> Signals:
-        """Signals of each joint, and of all joints together."""
-        each = {
-            f"{name}.{joint}": values[:, column].copy()
-            for name, values in joint_signals.items()
-            for column, joint in enumerate(self._joint_names)
-        }
-        error = joint_signals["link_error"]
-        rms_names = ("link_error", "deflection", "servo_error", "command_rate")
-        squares = {name: np.square(joint_signals[name]) for name in rms_names}
-        return {
-            **each,
-            **{name: np.sqrt(square.mean(axis=1)) for name, square in squares.items()},
-            "link_error_lowest": error.min(axis=1),
-            "link_error_highest": error.max(axis=1),
-            "link_error_largest": np.abs(error).max(axis=1),
-            "joint_torque": np.abs(joint_signals["joint_torque"]).max(axis=1),
-        }
 
 
 def _schedule(reference: PlanTable, imu_rate_hz: float, period_s: float) -> Records:
@@ -383,27 +264,3 @@ def _schedule(reference: PlanTable, imu_rate_hz: float, period_s: float) -> Reco
     rows["imu_is_due"] = is_due(np.arange(len(rows)), imu_rate_hz, period_s)
     rows.flags.writeable = False
     return rows
-
-
-def _inertial_imu(config: JointConfig, plant: JointPlant, num_worlds: int) -> PendulumImu | None:
-    """Make the IMU that computes its attitude; None in scenarios without one.
-
-    Raises:
-        ConfigurationError: The robot has no place for it.
-    """
-    scenario = config.scenario
-    if all(part.inertial_share == 0.0 for part in scenario.parts):
-        return None
-    if any(part.inertial_share < 1.0 for part in scenario.parts):
-        raise ConfigurationError(
-            f"scenario {scenario.name!r} gives only some robots an IMU that computes"
-            " its attitude; only the walker supports that, set inertial_share to 0 or 1"
-        )
-    if plant.imu_arm_m is None:
-        raise ConfigurationError(
-            f"scenario {scenario.name!r} is about the IMU on a link, which {plant.name}"
-            " does not have; choose another one, or the testbed or the walker"
-        )
-    gravity = float(np.linalg.norm(plant.model.opt.gravity))
-    place = (plant.imu_arm_m, gravity, config.control_period_s)
-    return PendulumImu(scenario.inertial, *place, num_worlds)

@@ -13,8 +13,11 @@ import mujoco
 import numpy as np
 import numpy.typing as npt
 
-from elastic_env.core.signals import SignalTable
+from elastic_env.core.signals import Array, SignalTable
+from elastic_env.joint.elasticity import joint_torque
 from elastic_env.joint.joint_names import JointAddresses, servo_name
+from elastic_env.world.physics import DIVERGED_RAD_S
+from elastic_env.world.sensors import angle_of_count
 
 Records: TypeAlias = npt.NDArray[Any]
 """An array of one of these types."""
@@ -128,3 +131,21 @@ def first_columns(table: SignalTable, groups: Sequence[str]) -> Records:
     record = record_type(*((group, WHOLE) for group in groups))
     columns = {group: table.group(group).start for group in groups}
     return single_record(record, **columns)
+
+
+def joint_rules(period_s: float, kinds: Sequence[tuple[int | None, bool]]) -> Records:
+    """Records of `RULES`, one per kind of world."""
+    rules = np.zeros(len(kinds), RULES)
+    rules["control_period_s"] = period_s
+    rules["count_rad"] = [angle_of_count(counts) for counts, _ in kinds]
+    rules["is_delayed"] = [is_delayed for _, is_delayed in kinds]
+    rules["highest_rad_s"] = DIVERGED_RAD_S
+    return rules
+
+
+def spring_torque(truth: Records) -> Array:
+    """Torque of spring and damper on the links, from the truth of joints, (rows, n) [N·m]."""
+    deflection = truth["theta"] - truth["q"]
+    rate = truth["theta_dot"] - truth["q_dot"]
+    spring = (truth["stiffness"], truth["damping"], truth["backlash"])
+    return joint_torque(deflection, rate, *spring)

@@ -2,7 +2,7 @@
 
     command → (physics) → truth → measured → score → observation
 
-Kernels do the arithmetic, see `elastic_env.world.control_kernels`. Blocks of records hold the last
+Kernels do the arithmetic, see `elastic_env.world.joint_kernels`. Blocks of records hold the last
 control steps. Signals and metrics are computed from them on demand.
 """
 
@@ -20,19 +20,19 @@ from elastic_env.core.compiled import compile_now
 from elastic_env.core.episode_random import EpisodeRandom
 from elastic_env.core.errors import ActionError
 from elastic_env.core.signals import Array, BoolArray, Signal, Signals, SignalTable
-from elastic_env.joint.elasticity import joint_torque
 from elastic_env.motion.trajectory import Motion, PlanTable
-from elastic_env.world import control_kernels as kernels
 from elastic_env.world import further_sensors as further
+from elastic_env.world import joint_kernels as kernels
 from elastic_env.world import joint_signals, records
 from elastic_env.world.further_sensors import FurtherSensors, SensorInputs
+from elastic_env.world.many_worlds import simulate
 from elastic_env.world.metrics import EpisodeMetrics, Metric
-from elastic_env.world.physics import DIVERGED_RAD_S, Simulation, simulate, substeps
-from elastic_env.world.records import Records, Sample
+from elastic_env.world.noise_stream import NoiseStream
+from elastic_env.world.physics import Simulation, substeps
+from elastic_env.world.records import Records, Sample, joint_rules, spring_torque
 from elastic_env.world.robot_model import RobotModel
 from elastic_env.world.robot_ranges import DrawnRobot
 from elastic_env.world.scenario import Scenario
-from elastic_env.world.sensors import NoiseStream, angle_of_count
 from elastic_env.world.step_info import StepInfo
 
 DIVERGED = "diverged"
@@ -131,7 +131,7 @@ class Task(ABC):
         self._addresses = records.joint_addresses(model, names)
         groups = joint_signals.JOINT_COLUMNS
         self._columns = records.first_columns(self.observation_table, groups)
-        self._rules = _joint_rules(config.control_period_s, kinds)
+        self._rules = joint_rules(config.control_period_s, kinds)
         self._kind = np.zeros(num_worlds, dtype=np.int64)
         self._scenarios = scenarios
         self._robots: dict[int, DrawnRobot] = {}
@@ -455,21 +455,3 @@ class Task(ABC):
             got = f"got {action[world]} in world {world}"
             problem = f"be finite, {bounds}, shape {shape[1:]} a world; {got}"
         return ActionError(f"an action must {problem}")
-
-
-def _joint_rules(period_s: float, kinds: Sequence[tuple[int | None, bool]]) -> Records:
-    """Records of `RULES`, one per kind of world."""
-    rules = np.zeros(len(kinds), records.RULES)
-    rules["control_period_s"] = period_s
-    rules["count_rad"] = [angle_of_count(counts) for counts, _ in kinds]
-    rules["is_delayed"] = [is_delayed for _, is_delayed in kinds]
-    rules["highest_rad_s"] = DIVERGED_RAD_S
-    return rules
-
-
-def spring_torque(truth: Records) -> Array:
-    """Torque of spring and damper on the links, from the truth of joints, (rows, n) [N·m]."""
-    deflection = truth["theta"] - truth["q"]
-    rate = truth["theta_dot"] - truth["q_dot"]
-    spring = (truth["stiffness"], truth["damping"], truth["backlash"])
-    return joint_torque(deflection, rate, *spring)

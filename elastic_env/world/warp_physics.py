@@ -2,7 +2,7 @@
 
 The control step and its state stay on the CPU, in double precision. A step of the physics sends the
 state to the device, and reads the bound fields back. The device computes in single precision: its
-results agree with those of `elastic_env.world.physics`, but not bit for bit.
+results agree with those of `elastic_env.world.worlds`, but not bit for bit.
 
 No other module imports MuJoCo Warp, which the extra `gpu` installs.
 """
@@ -20,7 +20,7 @@ from typing_extensions import override
 
 from elastic_env.core.errors import ConfigurationError, missing_extra, quote
 from elastic_env.core.signals import Array, BoolArray
-from elastic_env.world.physics import Worlds
+from elastic_env.world.worlds import Worlds
 
 try:
     import mujoco_warp

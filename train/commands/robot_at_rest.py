@@ -13,7 +13,7 @@ from elastic_env.joint.friction import dry_friction
 from elastic_env.rendering.picture import Image, with_text
 from elastic_env.rendering.sag import ENLARGEMENT, SagViews
 from elastic_env.robots.joint_robot import JointRobotConfig
-from elastic_env.world.joint_task import JointPlant
+from elastic_env.world.joint_plant import JointPlant
 from train.runs.console import make_table
 
 TABLE_STYLE: dict[str, Any] = {"box": box.SIMPLE_HEAD, "padding": (0, 1, 0, 0)}

@@ -13,9 +13,9 @@ from gymnasium.vector.utils import batch_space
 
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array, BoolArray
-from elastic_env.world.envs import reset_mask
 from elastic_env.world.robot_model import RobotModel
 from elastic_env.world.task import Task
+from elastic_env.world.vector_env import reset_mask
 from train.evaluate.conditions import Condition
 from train.evaluate.rollout import make_shared_env, shared_settings
 

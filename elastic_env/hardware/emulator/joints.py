@@ -15,7 +15,7 @@ from elastic_env.joint.joint_names import JointAddresses, servo_name
 from elastic_env.robots.robot.environment import configure_robot
 from elastic_env.robots.testbed.config import TestbedConfig
 from elastic_env.robots.testbed.model import JOINT, elastic_spec
-from elastic_env.world.physics import simulate
+from elastic_env.world.many_worlds import simulate
 
 _LARGEST_LAG_S = 0.25
 _ARM_STEP_S = 1e-3

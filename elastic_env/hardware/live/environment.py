@@ -31,11 +31,13 @@ from elastic_env.joint.joint_names import JointAddresses
 from elastic_env.robots.testbed.config import TestbedConfig
 from elastic_env.robots.testbed.environment import configure_testbed
 from elastic_env.robots.testbed.picture import TestbedPicture
-from elastic_env.world.envs import ElasticEnv, ElasticVectorEnv
-from elastic_env.world.joint_task import METRICS_OF_ONE, JointTask, JointTruth
+from elastic_env.world.env import ElasticEnv
+from elastic_env.world.joint_task import JointTask, JointTruth
+from elastic_env.world.link_signals import METRICS_OF_ONE
 from elastic_env.world.metrics import Metric
 from elastic_env.world.records import REAL, WHOLE, Records, record_type
 from elastic_env.world.sensors import AttitudeSensor
+from elastic_env.world.vector_env import ElasticVectorEnv
 
 TIMING_METRICS = (
     Metric("jitter_rms_s", "jitter", "rms", over="all"),

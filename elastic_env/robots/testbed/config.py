@@ -13,7 +13,7 @@ from elastic_env.robots.testbed import model as testbed
 from elastic_env.robots.testbed.model import JOINT, Pendulum
 from elastic_env.world.further_sensors import ACCELEROMETER, add_accelerometer
 from elastic_env.world.joint_config import JointConfig, require_torque
-from elastic_env.world.joint_task import JointPlant
+from elastic_env.world.joint_plant import JointPlant
 from elastic_env.world.robot_model import RobotModel
 
 

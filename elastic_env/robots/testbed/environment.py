@@ -49,7 +49,8 @@ from elastic_env.robots.testbed.model import Pendulum
 from elastic_env.robots.testbed.picture import TestbedPicture
 from elastic_env.world.joint_config import RewardWeights
 from elastic_env.world.joint_signals import ACTION_BOUND_RAD
-from elastic_env.world.joint_task import LINK_IMU_SENSOR, JointTask
+from elastic_env.world.joint_task import JointTask
+from elastic_env.world.link_signals import LINK_IMU_SENSOR
 from elastic_env.world.robot_model import read_stiffness
 from elastic_env.world.scenario import Scenario, make_scenario
 

@@ -16,7 +16,7 @@ from elastic_env.robots.thormang import config as walk_config
 from elastic_env.robots.thormang import records, walk_signals
 from elastic_env.robots.thormang.config import WalkConfig
 from elastic_env.robots.thormang.model import SIDES, biped
-from elastic_env.world import control_kernels as kernels
+from elastic_env.world import walk_kernels as kernels
 from elastic_env.world.foot_sensors import FootSensors
 from elastic_env.world.records import Records, single_record
 from elastic_env.world.robot_model import WalkerModel

@@ -1,7 +1,7 @@
 """The walking task: walk on elastic legs, in place or from foothold to foothold.
 
 The goal is a level pelvis, and ZMP and feet at their planned places. `score_walk` in
-`world.control_kernels` is the reward, `WalkRewardWeights` has its weights.
+`world.walk_kernels` is the reward, `WalkRewardWeights` has its weights.
 
 Observation of one world (float64); joints are l_hip_yaw, l_hip_roll, l_hip_pitch, l_knee,
 l_ankle_pitch, l_ankle_roll, then the same of the right leg (r_...); a name before a dot has one
@@ -81,11 +81,12 @@ from elastic_env.robots.thormang import NAME, constants, records, walk_signals
 from elastic_env.robots.thormang.config import WalkConfig, placed_robot
 from elastic_env.robots.thormang.constants import TOUCHDOWN, RobotKind
 from elastic_env.robots.thormang.model import biped
-from elastic_env.world import control_kernels as kernels
+from elastic_env.world import walk_kernels as kernels
 from elastic_env.world.foot_sensors import foot_errors
-from elastic_env.world.records import Records, Sample, first_columns
+from elastic_env.world.joint_kernels import EVERY_WORLD
+from elastic_env.world.records import Records, Sample, first_columns, spring_torque
 from elastic_env.world.robot_model import WalkerModel
-from elastic_env.world.task import Task, spring_torque
+from elastic_env.world.task import Task
 
 
 class WalkTask(Task):
@@ -249,7 +250,7 @@ class WalkTask(Task):
 
     def _sense_worlds(self, control: tuple[Any, ...]) -> bool:
         state = (self._physics, self._step, self._walker)
-        return kernels.sense_walk(*state, control, *kernels.EVERY_WORLD)
+        return kernels.sense_walk(*state, control, *EVERY_WORLD)
 
     def _observe_worlds(self, observation: Array) -> None:
         kernels.observe_all_walkers(self._step, self._walker, observation)
