@@ -14,7 +14,7 @@ from elastic_env.rendering.headless import prefer_egl
 
 if TYPE_CHECKING:
     from elastic_env.core.errors import ActionError, ConfigurationError, ElasticError
-    from elastic_env.joint.elasticity import ElasticJoint, Servo
+    from elastic_env.joint.elastic_joint import ElasticJoint, Servo
     from elastic_env.joint.make_elastic import make_elastic
     from elastic_env.joint.motor import Motor
     from elastic_env.joint.small_servos import small_servo
@@ -48,10 +48,10 @@ _MODULES = {
     "ActionError": "elastic_env.core.errors",
     "ConfigurationError": "elastic_env.core.errors",
     "ElasticError": "elastic_env.core.errors",
-    "ElasticJoint": "elastic_env.joint.elasticity",
+    "ElasticJoint": "elastic_env.joint.elastic_joint",
     "JointRobot": "elastic_env.robots.joint_robot",
     "Motor": "elastic_env.joint.motor",
-    "Servo": "elastic_env.joint.elasticity",
+    "Servo": "elastic_env.joint.elastic_joint",
     "VaryingFriction": "elastic_env.joint.varying_friction",
     "make_elastic": "elastic_env.joint.make_elastic",
     "small_servo": "elastic_env.joint.small_servos",

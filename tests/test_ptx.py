@@ -14,7 +14,7 @@ import pytest
 from numba.cuda import libdevicefuncs
 
 import elastic_env  # noqa: F401  registers the environments
-from elastic_env.world import joint_kernels, walk_kernels
+from elastic_env.world import attitude_kernels, joint_kernels, walk_kernels
 from tests.ptx import TARGET, ptx_of
 
 WALKER = "elastic_env/WalkInPlace-v0"
@@ -68,7 +68,8 @@ def test_a_control_step_compiles_to_ptx(
         records = [value.dtype for value in _arrays(given) if value.dtype.names]
         assert records
         assert all(kind.isalignedstruct for kind in records)
-        ptx = ptx_of(kernel, tuple(map(numba.typeof, given[:-2])), joint_kernels, walk_kernels)
+        kinds = tuple(map(numba.typeof, given[:-2]))
+        ptx = ptx_of(kernel, kinds, attitude_kernels, joint_kernels, walk_kernels)
         assert f".target {TARGET}" in ptx
         assert len(re.findall(r"^\.visible \.entry", ptx, re.MULTILINE)) == 1
         missing = set(re.findall(r"^\.extern \.func .*?(\w+)$", ptx, re.MULTILINE))

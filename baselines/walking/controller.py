@@ -32,7 +32,7 @@ from typing_extensions import override
 
 from baselines.compensation.compiled_rows import Records, WalkView, record_row, record_rows
 from baselines.compensation.contact_torque import cosine_and_sine, planned_feet, shifted_shares
-from baselines.compensation.filters import filter_share
+from baselines.compensation.filters import filter_share, within
 from baselines.compensation.inputs import PolicyInputs
 from baselines.compensation.policy import BatchPolicy, Step
 from baselines.compensation.ramp import feedback_ramp
@@ -434,11 +434,3 @@ def lengthening(
     bend = -distance / (thigh * shank * math.sin(knee)) * (0.5 * sign * difference)
     at_hip = -bend * shank * (shank + thigh * math.cos(knee)) / distance**2
     return at_hip, bend, -bend - at_hip
-
-
-@compiled_part
-def within(value: float, limit: float) -> float:
-    """Value within ±limit; nan stays nan."""
-    if value > limit:
-        return limit
-    return -limit if value < -limit else value

@@ -28,7 +28,7 @@ import numpy as np
 from typing_extensions import override
 
 from baselines.compensation.compiled_rows import WalkView, record_row
-from baselines.compensation.filters import filter_share
+from baselines.compensation.filters import filter_share, within
 from baselines.compensation.inputs import PolicyInputs
 from baselines.compensation.policy import Step
 from baselines.compensation.policy_around import MemoryAround, PolicyAround
@@ -191,11 +191,3 @@ def pitch_of_leg(gains: Any, right: Any, leg: int, turn: float, last: Any, memor
     before = last.leg_pitch[leg]
     memory.leg_pitch[leg] = before + following * (turn - before)
     return before + standing * (turn - before)
-
-
-@compiled_part
-def within(value: float, limit: float) -> float:
-    """Value within ±limit; nan stays nan."""
-    if value > limit:
-        return limit
-    return -limit if value < -limit else value

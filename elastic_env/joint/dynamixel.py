@@ -16,7 +16,7 @@
 
 import math
 
-from elastic_env.joint.elasticity import ElasticJoint, Servo
+from elastic_env.joint.elastic_joint import ElasticJoint, Servo
 
 ENCODER_COUNTS_PER_TURN = 501_923
 """Counts of the motor encoder per turn of the output."""

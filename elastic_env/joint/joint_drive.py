@@ -8,7 +8,7 @@ import numpy as np
 from mujoco import MjsActuator, MjSpec
 
 from elastic_env.core.errors import ConfigurationError
-from elastic_env.joint.elasticity import Servo
+from elastic_env.joint.elastic_joint import Servo
 from elastic_env.joint.joint_names import servo_name
 from elastic_env.joint.motor import Motor
 

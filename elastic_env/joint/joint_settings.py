@@ -13,7 +13,7 @@ import numpy as np
 
 from elastic_env.core.config import Model, quantity, read_mapping
 from elastic_env.core.errors import ConfigurationError, quote, unknown_name
-from elastic_env.joint.elasticity import FrictionTerms
+from elastic_env.joint.elastic_joint import FrictionTerms
 from elastic_env.joint.motor import Motor
 from elastic_env.joint.small_servos import SMALL_SERVOS, small_servo
 

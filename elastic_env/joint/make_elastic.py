@@ -24,7 +24,7 @@ from mujoco import MjsBody, MjsJoint, MjSpec
 from elastic_env.core.errors import ConfigurationError, quote, require_known
 from elastic_env.core.signals import Array
 from elastic_env.joint.compile_model import compile_spec
-from elastic_env.joint.elasticity import ElasticJoint
+from elastic_env.joint.elastic_joint import ElasticJoint
 from elastic_env.joint.joint_drive import BLANK, ActuatorRule, drive_joint
 from elastic_env.joint.joint_names import motor_name, part_names, spring_name
 from elastic_env.joint.keyframes import carry_keyframes

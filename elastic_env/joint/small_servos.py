@@ -38,7 +38,7 @@ import numpy as np
 
 from elastic_env.core.errors import require_known
 from elastic_env.core.files import read_rows
-from elastic_env.joint.elasticity import ElasticJoint, Servo
+from elastic_env.joint.elastic_joint import ElasticJoint, Servo
 from elastic_env.joint.motor import Motor
 
 _COUNTS_PER_TURN = 4096

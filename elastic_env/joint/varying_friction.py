@@ -13,7 +13,6 @@ from them. A program with its own loop does so in one line:
 Load and speed are those at the beginning of the step: friction lags by one physics step.
 """
 
-import math
 from collections.abc import Callable
 from typing import Any, Self
 
@@ -22,7 +21,8 @@ import numpy as np
 
 from elastic_env.core.compiled import compiled
 from elastic_env.core.signals import Array
-from elastic_env.joint.elasticity import ElasticJoint
+from elastic_env.joint.elastic_joint import ElasticJoint
+from elastic_env.joint.elasticity import wound_deflection
 from elastic_env.joint.friction import dry_friction_rows
 from elastic_env.joint.joint_names import JointAddresses, friction_name, spring_name
 
@@ -161,9 +161,7 @@ def _set_spring_load(
         for i in range(len(joints)):
             spring, theta, q, theta_dot, q_dot = springs[:, i]
             ends = lengths[world % len(lengths), spring]
-            deflection = qpos[world, theta] - qpos[world, q]
-            wound = max(abs(deflection) - (ends[1] - ends[0]) / 2.0, 0.0)
-            deflection = math.copysign(wound, deflection)
+            deflection = wound_deflection(qpos[world, theta] - qpos[world, q], ends[1] - ends[0])
             spring_torque = stiffness[world % len(stiffness), spring] * deflection
             rate = qvel[world, theta_dot] - qvel[world, q_dot]
             damper_torque = damping[world % len(damping), spring] * rate

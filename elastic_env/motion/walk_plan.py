@@ -24,7 +24,7 @@ import numpy as np
 
 from elastic_env.core.errors import ConfigurationError, ElasticError
 from elastic_env.core.signals import Array
-from elastic_env.joint.elasticity import Servo
+from elastic_env.joint.elastic_joint import Servo
 from elastic_env.motion import gait as gaits
 from elastic_env.motion.foot_clearance import require_clear_feet
 from elastic_env.motion.gait import RIGHT, Footholds, Gait, Timing

@@ -22,7 +22,7 @@ from mujoco import MjModel, MjSpec
 from elastic_env.core.config import Model, read_mapping
 from elastic_env.core.errors import missing_extra, require_known
 from elastic_env.core.signals import Array
-from elastic_env.joint.elasticity import ElasticJoint, Servo
+from elastic_env.joint.elastic_joint import ElasticJoint, Servo
 from elastic_env.joint.model_file import read_model
 from elastic_env.joint.model_joints import hinges_of, mass_matrix
 from elastic_env.rigid.rigid_body import RigidBody

@@ -21,7 +21,7 @@ from mujoco import MjSpec
 
 from elastic_env.core.config import Model
 from elastic_env.core.errors import ConfigurationError, require_known
-from elastic_env.joint.elasticity import ElasticJoint
+from elastic_env.joint.elastic_joint import ElasticJoint
 from elastic_env.joint.make_elastic import transform_hinges
 from elastic_env.motion import arm_references
 from elastic_env.motion.arm_references import AnyArmReference, ArmReference, Workspace

@@ -8,7 +8,7 @@ from pydantic import Field
 from elastic_env.core.config import Model, Title, quantity
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
-from elastic_env.joint.elasticity import ElasticJoint
+from elastic_env.joint.elastic_joint import ElasticJoint
 from elastic_env.motion.references import Hold, Reference
 from elastic_env.world.joint_signals import ACTION_BOUND_RAD
 from elastic_env.world.robot_ranges import WALKER_FIELDS

@@ -7,7 +7,7 @@ from numpy.random import Generator
 
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array, BoolArray
-from elastic_env.world import walk_kernels as kernels
+from elastic_env.world import attitude_kernels as kernels
 from elastic_env.world.joint_config import JointConfig
 from elastic_env.world.joint_plant import JointPlant
 from elastic_env.world.noise_stream import NoiseStream

@@ -10,7 +10,7 @@ from typing_extensions import override
 from elastic_env.core.config import Model
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array, IntArray
-from elastic_env.joint.elasticity import ElasticJoint, Servo
+from elastic_env.joint.elastic_joint import ElasticJoint, Servo
 from elastic_env.joint.joint_names import JointAddresses, servo_name
 from elastic_env.robots.robot.environment import configure_robot
 from elastic_env.robots.testbed.config import TestbedConfig

@@ -11,7 +11,7 @@ from mujoco import MjModel, MjSpec
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
 from elastic_env.joint import joint_settings
-from elastic_env.joint.elasticity import ElasticJoint, Servo
+from elastic_env.joint.elastic_joint import ElasticJoint, Servo
 from elastic_env.joint.joint_settings import JointSettings, ServoSettings
 from elastic_env.joint.model_joints import home_of, mass_matrix
 from elastic_env.joint.model_servo import force_limit, position_servo, rotor_inertia

@@ -6,7 +6,7 @@ import numpy as np
 
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.joint.dynamixel import H54_200_S500_R
-from elastic_env.joint.elasticity import ElasticJoint
+from elastic_env.joint.elastic_joint import ElasticJoint
 from elastic_env.motion.trajectory import Motion
 from elastic_env.robots.testbed import NAME
 from elastic_env.robots.testbed import model as testbed
@@ -69,7 +69,7 @@ class TestbedConfig(JointConfig):
     def _require_feasible(self, joint: ElasticJoint, pendulum: Pendulum) -> None:
         if joint.servo is None:
             problem = "the testbed's joint needs a servo, got None"
-            raise ConfigurationError(f"{problem}; see elastic_env.joint.elasticity.Servo")
+            raise ConfigurationError(f"{problem}; see elastic_env.joint.elastic_joint.Servo")
         robot = self._robot_model(joint, pendulum)
         if not self.reference.is_random:
             plan = self.reference.plan(np.random.default_rng(0), self.control_period_s)

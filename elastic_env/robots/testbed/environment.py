@@ -39,7 +39,7 @@ from typing import Any, Literal
 
 from elastic_env.core.errors import ConfigurationError, quote
 from elastic_env.joint.dynamixel import H54_200_S500_R
-from elastic_env.joint.elasticity import ElasticJoint
+from elastic_env.joint.elastic_joint import ElasticJoint
 from elastic_env.joint.small_servos import small_servo
 from elastic_env.motion.references import AnyReference, make_reference
 from elastic_env.registration import Robot, as_model

@@ -13,7 +13,7 @@ from mujoco import MjSpec
 
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array
-from elastic_env.joint.elasticity import ElasticJoint
+from elastic_env.joint.elastic_joint import ElasticJoint
 from elastic_env.joint.make_elastic import Form, transform_hinges
 
 JOINT = "joint"

@@ -9,7 +9,7 @@ from mujoco import MjModel
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.errors import ConfigurationError, ElasticError
 from elastic_env.core.signals import Array
-from elastic_env.joint.elasticity import ElasticJoint
+from elastic_env.joint.elastic_joint import ElasticJoint
 from elastic_env.joint.joint_names import JointAddresses
 from elastic_env.joint.time_step import require_stable
 from elastic_env.joint.varying_friction import varies

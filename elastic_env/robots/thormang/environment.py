@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from elastic_env.core.errors import ConfigurationError, quote, require_known
-from elastic_env.joint.elasticity import ElasticJoint
+from elastic_env.joint.elastic_joint import ElasticJoint
 from elastic_env.motion.gait import Gait, make_gait
 from elastic_env.registration import Robot, as_model
 from elastic_env.robots.thormang import ID, NAME

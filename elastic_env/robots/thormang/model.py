@@ -29,7 +29,7 @@ from elastic_env.core.config import Model, quantity
 from elastic_env.core.files import read_rows
 from elastic_env.core.signals import Array
 from elastic_env.joint.dynamixel import H54_200_S500_R
-from elastic_env.joint.elasticity import ElasticJoint
+from elastic_env.joint.elastic_joint import ElasticJoint
 from elastic_env.joint.make_elastic import Form, transform_hinges
 from elastic_env.rigid.biped import Biped
 from elastic_env.rigid.leg_kinematics import JOINTS, LegGeometry

@@ -82,6 +82,7 @@ from elastic_env.robots.thormang.config import WalkConfig, placed_robot
 from elastic_env.robots.thormang.constants import TOUCHDOWN, RobotKind
 from elastic_env.robots.thormang.model import biped
 from elastic_env.world import walk_kernels as kernels
+from elastic_env.world.attitude_kernels import rotations_of
 from elastic_env.world.foot_sensors import foot_errors
 from elastic_env.world.joint_kernels import EVERY_WORLD
 from elastic_env.world.records import Records, Sample, first_columns, spring_torque
@@ -168,7 +169,7 @@ class WalkTask(Task):
             **{name: self._bias[name].copy() for name in ("load", "slope", "friction")},
             **{name: body[name].copy() for name in body_fields},
             mounting=self._bias["imu_attitude"].copy(),
-            pelvis_R=kernels.rotations_of(body["quaternion"].copy()),
+            pelvis_R=rotations_of(body["quaternion"].copy()),
             attitude=np.column_stack([body["roll"], body["pitch"]]),
             models=self._true_models,
         )
