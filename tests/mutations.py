@@ -2,11 +2,14 @@
 
 python -m tests.mutations FIRST COUNT     plays cases in this process and prints what was neither
 taken nor refused
+
+Cases may be drawn from configurations with short walks: long ones take seconds to plan.
 """
 
 import copy
 import json
 import random
+import re
 import resource
 import shutil
 import sys
@@ -259,22 +262,30 @@ def damage(data: bytes, draw: random.Random) -> bytes:
     return bytes(text)
 
 
-def mutated_configuration(draw: random.Random, path: Path) -> Callable[[Path], None]:
+def with_short_walks(text: str) -> str:
+    """A configuration whose walks have six steps where they have more."""
+    return re.sub(r"num_steps(: |=)(20|40)\b", r"num_steps\g<1>6", text)
+
+
+def mutated_configuration(
+    draw: random.Random, path: Path, short_walks: bool
+) -> Callable[[Path], None]:
     """Write a configuration with mistakes; what reads it, now and then what is not meant to."""
     source = draw.choice(CONFIGS)
     meant = next(
         (reader for name, reader in READERS.items() if source.name.startswith(name)),
         read_comparison,
     )
-    _mutate(draw, source, path)
+    text = source.read_text(encoding="utf-8")
+    _mutate(draw, with_short_walks(text) if short_walks else text, path)
     return meant if draw.random() < 0.95 else draw.choice(list(READERS.values()))
 
 
-def _mutate(draw: random.Random, source: Path, path: Path) -> None:
+def _mutate(draw: random.Random, text: str, path: Path) -> None:
     if draw.random() < 0.3:
-        path.write_bytes(damage(source.read_bytes(), draw))
+        path.write_bytes(damage(text.encode(), draw))
         return
-    tree = parse_yaml(source.read_text(encoding="utf-8"))
+    tree = parse_yaml(text)
     for _ in range(draw.randrange(1, 4)):
         tree = change(tree, draw)
     path.write_text(yaml.safe_dump(tree, allow_unicode=False), encoding="utf-8")
@@ -344,7 +355,7 @@ READERS: dict[str, Callable[[Path], None]] = {
 """What reads the shipped configurations, by the beginning of their names."""
 
 
-def play(number: int, folder: Path) -> str:
+def play(number: int, folder: Path, short_walks: bool = False) -> str:
     """Outcome of a case: "taken", or what refused it.
 
     Raises:
@@ -357,7 +368,7 @@ def play(number: int, folder: Path) -> str:
             mutated_residual(draw, path)
             read_residual(path)
         else:
-            mutated_configuration(draw, path)(path)
+            mutated_configuration(draw, path, short_walks)(path)
     except ElasticError as error:
         return str(error)
     finally:
@@ -365,7 +376,7 @@ def play(number: int, folder: Path) -> str:
     return "taken"
 
 
-def main(first: int, count: int) -> int:
+def main(first: int, count: int, short_walks: bool = False) -> int:
     """Play cases and say which were faults, and how many were taken; the number of faults."""
     faults = 0
     taken = 0
@@ -375,7 +386,7 @@ def main(first: int, count: int) -> int:
         for number in range(first, first + count):
             began = time.process_time()
             try:
-                outcome = play(number, Path(folder))
+                outcome = play(number, Path(folder), short_walks)
                 taken = taken + (outcome == "taken")
                 longest = max(longest, len(outcome))
                 if len(outcome) > LONGEST_ERROR:

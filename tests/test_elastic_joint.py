@@ -1,6 +1,7 @@
 """The transform to elastic joints: closed forms, energy, MuJoCo's own rigid model, and models
 that are not ours."""
 
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -299,7 +300,7 @@ def test_the_servo_is_a_pid_on_the_rotor() -> None:
 def foreign_cases() -> list[object]:
     """All models with the hinges that become elastic; Gymnasium's with every hinge they have."""
     cases: list[object] = [
-        pytest.param(xml, names, id=name) for name, (xml, names) in MODELS.items()
+        pytest.param(xml, tuple(names), id=name) for name, (xml, names) in MODELS.items()
     ]
     return cases + [pytest.param(path, None, id=path.stem) for path in ASSETS]
 
@@ -375,9 +376,10 @@ def random_states(
     return states
 
 
+@cache
 def elastic_from(
     source: str | Path,
-    names: list[str] | None,
+    names: tuple[str, ...] | None,
     joint: ElasticJoint = FOREIGN,
     form: Form = "tendon",
 ) -> tuple[mujoco.MjModel, mujoco.MjModel, list[str]]:
@@ -385,7 +387,7 @@ def elastic_from(
     hinges."""
     spec = load(source)
     spec.option.timestep = STEP_S
-    chosen = names if names is not None else hinges(spec)
+    chosen = list(names) if names is not None else hinges(spec)
     return spec.compile(), make_elastic(spec, dict.fromkeys(chosen, joint), form).compile(), chosen
 
 
@@ -399,7 +401,7 @@ FORMS_OF_ALL = [
 @pytest.mark.parametrize(("source", "names"), foreign_cases())
 @pytest.mark.filterwarnings("ignore:compiler attribute 'settotalmass' is deprecated")
 def test_total_mass_and_names_are_kept(
-    source: str | Path, names: list[str] | None, form: Form
+    source: str | Path, names: tuple[str, ...] | None, form: Form
 ) -> None:
     """Catches rotors that weigh something, bodies that vanish and elements that change their
     order."""
@@ -441,7 +443,7 @@ def _element_names(model: mujoco.MjModel, kind: str) -> list[str]:
 @pytest.mark.parametrize(("source", "names"), foreign_cases())
 @pytest.mark.filterwarnings("ignore:compiler attribute 'settotalmass' is deprecated")
 def test_undeflected_dynamics_are_those_of_the_rigid_model(
-    source: str | Path, names: list[str] | None, form: Form
+    source: str | Path, names: tuple[str, ...] | None, form: Form
 ) -> None:
     """Catches all that a rotor may bring along: weight, drag in air or water, defaults of its
     class, lost actuators.
@@ -466,7 +468,7 @@ def test_undeflected_dynamics_are_those_of_the_rigid_model(
 @pytest.mark.parametrize(("source", "names"), foreign_cases())
 @pytest.mark.filterwarnings("ignore:compiler attribute 'settotalmass' is deprecated")
 def test_sensors_contacts_and_limits_are_those_of_the_rigid_model(
-    source: str | Path, names: list[str] | None
+    source: str | Path, names: tuple[str, ...] | None
 ) -> None:
     """Catches sensors that read the rotor, limits that moved or lost their unit, and collisions
     of rotors."""
@@ -493,7 +495,7 @@ def test_sensors_contacts_and_limits_are_those_of_the_rigid_model(
 
 @pytest.mark.parametrize(("source", "names"), foreign_cases())
 @pytest.mark.filterwarnings("ignore:compiler attribute 'settotalmass' is deprecated")
-def test_foreign_models_run(source: str | Path, names: list[str] | None) -> None:
+def test_foreign_models_run(source: str | Path, names: tuple[str, ...] | None) -> None:
     """Catches models that compile and then blow up."""
     _, model, _ = elastic_from(
         source, names, ElasticJoint(stiffness=2000.0, damping=5.0, rotor_inertia=0.05)
@@ -831,7 +833,7 @@ def test_the_force_range_of_a_hinge_limits_its_rotor() -> None:
     assert data.qfrc_actuator[model.joint(motor_name("yaw")).dofadr[0]] == 60.0
 
 
-@pytest.mark.parametrize("speed", [5.0, -8.0])
+@pytest.mark.parametrize("speed", [5.0, pytest.param(-8.0, marks=pytest.mark.slow)])
 def test_wheels_on_velocity_actuators_roll(speed: float) -> None:
     """Catches unnamed actuators that stay on the link; the springs wind up by the torque over K,
     not without end."""

@@ -115,9 +115,9 @@ def test_errors_of_the_feet_change_nothing_else() -> None:
     exact: dict[str, Any] = dict.fromkeys(FOOT_ERRORS, 0.0)
     for changes in (exact, {}):
         scenario = make_scenario("sensor").replace(**changes)
-        env = walkers(scenario, sensors=["link_encoder", "joint_torque"])
+        env = walkers(scenario, 1, sensors=["link_encoder", "joint_torque"])
         first, _ = env.reset(seed=3)
-        rows = [env.step(np.zeros((2, 12), np.float32))[0] for _ in range(5)]
+        rows = [env.step(np.zeros((1, 12), np.float32))[0] for _ in range(5)]
         again, _ = env.reset()
         seen.append(np.array([first, *rows, again]))
     columns = env.unwrapped.task.observation_table.group("wrench")

@@ -34,7 +34,7 @@ def walker(**options: Any) -> Any:
 
 def test_a_constant_bias_goes_with_the_first_swing_of_each_foot() -> None:
     """Catches the wrong foot, the wrong sign, a mean that goes on, and a loaded foot."""
-    walk = walker(num_steps=4).task
+    walk = walker(num_steps=4, step_period=1.1).task
     model = walk.assumed_model
     recorder = Recorder(model)
     policy = FootTare(recorder, model, FootTareGains())

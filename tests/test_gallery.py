@@ -40,6 +40,14 @@ from tests.gallery_files import FOLDER, PACKAGED, excerpt
 pytestmark = pytest.mark.filterwarnings("error::UserWarning")
 
 
+MORE_RIGID = ["ur5", "talos_arm", "so101", "pusher"]
+
+
+def some_tonight(*now: str) -> list[object]:
+    """All robots: some with every commit, and the others at night."""
+    return [pytest.param(n, marks=[pytest.mark.slow] * (n not in now)) for n in GALLERY]
+
+
 @cache
 def rigid(name: str) -> mujoco.MjModel:
     """The model as it was; the slides of grippers are held."""
@@ -61,7 +69,7 @@ def sides(model: mujoco.MjModel, hinges: list[str]) -> tuple[list[int], list[int
     return [of(motor_name(hinge)) for hinge in hinges], [of(hinge) for hinge in hinges]
 
 
-@pytest.mark.parametrize("name", GALLERY)
+@pytest.mark.parametrize("name", some_tonight("panda", "talos_arm", "so101"))
 def test_a_robot_with_elastic_hinges_moves_for_four_seconds(name: str) -> None:
     """Catches a hinge that stayed rigid, a spring that explodes or swings up, and a reset that
     would hide it."""
@@ -127,7 +135,9 @@ def test_the_limit_of_rigid_joints_is_the_model_as_it_was(name: str) -> None:
         )
 
 
-@pytest.mark.parametrize("name", ["panda", "ur5", "talos_arm", "so101", "pusher"])
+@pytest.mark.parametrize(
+    "name", ["panda", *(pytest.param(n, marks=pytest.mark.slow) for n in MORE_RIGID)]
+)
 def test_stiffer_joints_move_ever_more_like_rigid_ones(name: str) -> None:
     """Catches a limit that is right on paper and not in motion: ten times the stiffness is a
     tenth of the deviation."""

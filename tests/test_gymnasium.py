@@ -102,7 +102,10 @@ def test_rollouts_of_one_seed_are_equal(name: str) -> None:
 
 @pytest.mark.parametrize(
     ("name", "start_method"),
-    [(IDS[0], "fork"), (IDS[1], "fork"), pytest.param(IDS[1], "spawn", marks=pytest.mark.slow)],
+    [
+        (IDS[0], "fork"),
+        *(pytest.param(IDS[1], start, marks=pytest.mark.slow) for start in ("fork", "spawn")),
+    ],
 )
 def test_processes_of_stable_baselines3_play_as_this_one(name: str, start_method: str) -> None:
     """Catches an environment that does not survive the way into a process, with threads that a

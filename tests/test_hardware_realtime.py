@@ -50,6 +50,7 @@ def in_realtime() -> Iterator[None]:
     give_up_realtime()
 
 
+@pytest.mark.slow  # on every commit: the priority that the supervisor has asked for
 @pytest.mark.usefixtures("one_core")
 def test_a_program_that_keeps_the_processor_busy_does_not_keep_torque_on() -> None:
     """Catches a supervisor that waits in a line with the program whose hang it is to end."""

@@ -3,6 +3,7 @@ times and bad."""
 
 import os
 import pty
+import re
 import signal
 import subprocess
 import sys
@@ -31,8 +32,15 @@ from elastic_env.hardware.errors import (
     ReplyError,
 )
 from elastic_env.hardware.imu import AttitudeStream
+from elastic_env.hardware.safety import supervised_bus
 from elastic_env.hardware.safety.checks import check_bus
 from elastic_env.hardware.safety.guard import Guard
+from elastic_env.hardware.safety.realtime import (
+    LONGEST_WAIT_S,
+    Priority,
+    give_up_realtime,
+    prefer_realtime,
+)
 from elastic_env.hardware.safety.supervised_bus import SupervisedBus
 from elastic_env.hardware.settings import SafetyLimits
 from tests.busy import once_more
@@ -163,18 +171,47 @@ def running() -> Iterator[RunningEmulator]:
         yield running
 
 
+def without_faults(emulator: RunningEmulator) -> None:
+    """Undo the faults that a test may have left, and wait for the servos' rest."""
+    emulator.faults(overload=False, silent=False, unheard=0, late=0, latency_s=0)
+    wait_until_rest(emulator)
+
+
+@pytest.fixture(scope="module")
+def buses() -> Iterator[list[SupervisedBus]]:
+    """The bus, or none, that tests after one another share: its process takes long to start."""
+    shared: list[SupervisedBus] = []
+    yield shared
+    close_all(shared)
+
+
+def close_all(shared: list[SupervisedBus]) -> None:
+    while shared:
+        with suppress(HardwareError):
+            shared.pop().close()
+
+
 @pytest.fixture
-def emulator(running: RunningEmulator) -> RunningEmulator:
-    """The one emulator, at rest and without the faults that a test before may have left."""
-    running.faults(overload=False, silent=False, unheard=0, late=0, latency_s=0)
-    wait_until_rest(running)
+def emulator(running: RunningEmulator, buses: list[SupervisedBus]) -> RunningEmulator:
+    """The one emulator, at rest and without faults; its port is free."""
+    close_all(buses)
+    without_faults(running)
     return running
 
 
 @pytest.fixture
-def supervised(emulator: RunningEmulator) -> Iterator[SupervisedBus]:
-    with SupervisedBus({emulator.port: [1, 2]}) as bus:
-        yield bus
+def supervised(running: RunningEmulator, buses: list[SupervisedBus]) -> Iterator[SupervisedBus]:
+    """The one bus at the emulator, at rest and without faults; torque is off when a test ends."""
+    without_faults(running)
+    if not buses:
+        buses.append(SupervisedBus({running.port: [1, 2]}))
+    yield buses[0]
+    without_faults(running)
+    try:
+        buses[0].disable()
+    except HardwareError:  # a test has ended its supervisor
+        close_all(buses)
+    assert running.state()["torque_on"] == [False, False]
 
 
 def cycle(bus: SupervisedBus, goals: list[float], number: int = 1) -> None:
@@ -300,104 +337,136 @@ def test_late_replies_are_not_taken_for_the_next_ones(emulator: RunningEmulator)
         assert bus.read_states(0.1).is_fresh.all()
 
 
-def test_second_program_is_told_which_port_is_taken(
-    emulator: RunningEmulator, supervised: SupervisedBus
-) -> None:
-    """Catches two programs on one bus, one directly and one through a supervisor; and a port that
-    is opened for an IMU, and its input thrown away, before anybody has asked whether it is free."""
-    for intrude in (
-        lambda: DynamixelBus(emulator.port).open(),
-        lambda: SupervisedBus({emulator.port: [1]}),
-    ):
-        with pytest.raises(PortError, match=emulator.port):
-            intrude()
-    start = supervised.enable(PATIENT)
-    assert len(start) == 2
-    cycle(supervised, start.tolist(), 5)
-    for _ in range(5):
-        with pytest.raises(PortError, match=f"another program uses {emulator.port}"):
-            AttitudeStream(emulator.port)
-        cycle(supervised, start.tolist(), 5)
-
-
 def test_servos_follow_and_torque_goes_off_at_the_end(emulator: RunningEmulator) -> None:
-    """Catches goals that do not arrive in the servos' units, and a program that ends with torque
-    on, by itself or by Ctrl-C."""
-    with SupervisedBus({emulator.port: [1, 2]}) as bus:
+    """Catches goals that do not arrive in the servos' units, and a program that ends by Ctrl-C
+    with torque on; the tests of the shared bus end by themselves."""
+    with suppress(KeyboardInterrupt), SupervisedBus({emulator.port: [1, 2]}) as bus:
+        assert bus._answer_s == supervised_bus._ANSWER_S
         start = bus.enable(PATIENT)
         begin = time.monotonic()
         while (elapsed := time.monotonic() - begin) < 0.6:
             share = min(elapsed / 0.4, 1.0)
             cycle(bus, (start + share * (np.array([0.1, -0.1]) - start)).tolist())
         assert emulator.state()["theta"] == pytest.approx([0.1, -0.1], abs=0.02)
-    assert emulator.state()["torque_on"] == [False, False]
-    wait_until_rest(emulator)
-    with suppress(KeyboardInterrupt), SupervisedBus({emulator.port: [1, 2]}) as bus:
-        cycle(bus, bus.enable(PATIENT).tolist(), 5)
         assert emulator.state()["torque_on"] == [True, True]
         signal.raise_signal(signal.SIGINT)
         pytest.fail("nothing was interrupted")
     assert emulator.state()["torque_on"] == [False, False]
 
 
+def test_second_program_is_told_which_port_is_taken(
+    running: RunningEmulator, supervised: SupervisedBus
+) -> None:
+    """Catches two programs on one bus, one directly and one through a supervisor; and a port that
+    is opened for an IMU, and its input thrown away, before anybody has asked whether it is free."""
+    for intrude in (
+        lambda: DynamixelBus(running.port).open(),
+        lambda: SupervisedBus({running.port: [1]}),
+    ):
+        with pytest.raises(PortError, match=running.port):
+            intrude()
+    start = supervised.enable(PATIENT)
+    assert len(start) == 2
+    cycle(supervised, start.tolist(), 5)
+    for _ in range(5):
+        with pytest.raises(PortError, match=f"another program uses {running.port}"):
+            AttitudeStream(running.port)
+        cycle(supervised, start.tolist(), 5)
+
+
+def test_the_supervisor_runs_before_the_program(supervised: SupervisedBus) -> None:
+    """Catches a supervisor that waits in a line with the program whose hang it is to end."""
+    is_granted = prefer_realtime(Priority.LOOP)
+    give_up_realtime()
+    expected = Priority.SUPERVISOR if is_granted else 0
+    assert os.sched_getparam(supervised.process_id).sched_priority == expected
+
+
+def test_the_limit_on_silence_is_the_one_that_was_given(supervised: SupervisedBus) -> None:
+    """Catches a limit that `enable` does not pass on, or does not pass on the second time."""
+    for hang_s in (0.05, 0.09, 0.005):
+        supervised.enable(SafetyLimits(hang_s=hang_s))
+        assert supervised._answer_s == max(hang_s, 0.02)
+        assert ("--patient" in supervised._hint) == (hang_s < 0.09)
+        supervised.disable()
+
+
 def test_torque_is_off_when_the_program_waits_too_long(
-    emulator: RunningEmulator, supervised: SupervisedBus
+    running: RunningEmulator, supervised: SupervisedBus
 ) -> None:
     """Catches a supervisor that waits for ever, and a program that is not told why nothing
     moves."""
     supervised.enable(PATIENT.replace(hang_s=0.05))
-    emulator.events()
+    running.events()
     cycle(supervised, [0.0, 0.0], 3)
     last = time.monotonic()
     time.sleep(0.15)
-    off = torque_events(emulator, 0)
+    off = torque_events(running, 0)
     assert min(off) - last < 0.1
     with pytest.raises(FaultError, match="no command for 50 ms"):
         cycle(supervised, [0.0, 0.0])
 
 
 def test_overload_stops_all_and_is_named(
-    emulator: RunningEmulator, supervised: SupervisedBus
+    running: RunningEmulator, supervised: SupervisedBus
 ) -> None:
     """Catches an alert bit that is overlooked because it comes with success."""
     supervised.enable(PATIENT)
-    emulator.faults(overload=True)
+    running.faults(overload=True)
     with pytest.raises(FaultError, match=r"torque is off \(servo 1 at .*overload"):
         cycle(supervised, [0.0, 0.0], 12)
     with pytest.raises(FaultError, match="overload"):
         supervised.enable()
-    emulator.faults(overload=False)
-    assert emulator.state()["torque_on"] == [False, False]
-
-
-def test_a_supervisor_that_hangs_is_ended_and_torque_switched_off(
-    emulator: RunningEmulator, supervised: SupervisedBus
-) -> None:
-    """Catches a program that waits for ever for an answer while a servo holds its last goal."""
-    supervised.enable(PATIENT)
-    emulator.events()
-    said = r"did not answer within .* ms and was ended; torque is off; end what else keeps"
-    with stopped(supervised.process_id), pytest.raises(FaultError, match=said):
-        cycle(supervised, [0.0, 0.0])
-    assert torque_events(emulator, 0)
-    with pytest.raises(FaultError, match="torque is off"):
-        cycle(supervised, [0.0, 0.0])
+    running.faults(overload=False)
+    assert running.state()["torque_on"] == [False, False]
 
 
 def test_a_supervisor_that_waits_for_silent_servos_is_not_taken_for_dead(
-    emulator: RunningEmulator, supervised: SupervisedBus
+    running: RunningEmulator, supervised: SupervisedBus
 ) -> None:
     """Catches a limit on its answer that is shorter than the tries to have torque off confirmed."""
     supervised.enable()
-    emulator.events()
-    emulator.faults(silent=True)
+    running.events()
+    running.faults(silent=True)
     with pytest.raises(
         FaultError, match=r"sent, but not confirmed by servo 1 at .*, servo 2 at .*: switch"
     ):
         cycle(supervised, [0.0, 0.0], 12)
-    emulator.faults(silent=False)
-    assert torque_events(emulator, 0)
+    running.faults(silent=False)
+    assert torque_events(running, 0)
     supervised.disable()
+
+
+def test_a_supervisor_that_hangs_is_ended_and_torque_switched_off(
+    running: RunningEmulator, supervised: SupervisedBus
+) -> None:
+    """Catches a program that waits for ever for an answer while a servo holds its last goal, and
+    a supervisor that may hang for 100 ms where its program may hang for 50 ms."""
+    supervised.enable(PATIENT)
+    supervised._answer_s = 0.05
+    running.events()
+    said = r"did not answer within (\d+) ms and was ended; torque is off; end what else keeps"
+    with stopped(supervised.process_id), pytest.raises(FaultError, match=said) as caught:
+        cycle(supervised, [0.0, 0.0])
+    found = re.search(r"within (\d+) ms", str(caught.value))
+    assert found is not None
+    assert 50 <= int(found[1]) <= 50 + 1000 * LONGEST_WAIT_S
+    assert torque_events(running, 0)
+    with pytest.raises(FaultError, match="torque is off"):
+        cycle(supervised, [0.0, 0.0])
+
+
+def test_torque_goes_off_when_the_supervisor_dies(
+    running: RunningEmulator, supervised: SupervisedBus
+) -> None:
+    """Catches a servo that holds its last goal when nobody watches over it any more."""
+    cycle(supervised, supervised.enable(PATIENT).tolist(), 5)
+    running.events()
+    begin = time.monotonic()
+    os.kill(supervised.process_id, signal.SIGKILL)
+    with pytest.raises(FaultError, match=r"ended \(exit code -9\); torque is off"):
+        cycle(supervised, [0.0, 0.0], 5)
+    assert min(torque_events(running, 0)) - begin < 0.1
 
 
 def test_instructions_that_are_lost_reach_no_servo(emulator: RunningEmulator) -> None:
@@ -422,8 +491,10 @@ def test_ids_that_cannot_be_are_refused_before_anything_starts() -> None:
     "how",
     [
         "kill",
-        "kill-supervisor",
-        *(pytest.param(how, marks=pytest.mark.slow) for how in ("stop", "interrupt")),
+        *(
+            pytest.param(how, marks=pytest.mark.slow)
+            for how in ("kill-supervisor", "stop", "interrupt")
+        ),
     ],
 )
 def test_torque_goes_off_whatever_ends_the_program(emulator: RunningEmulator, how: str) -> None:

@@ -14,6 +14,7 @@ import time
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import gymnasium
@@ -24,7 +25,7 @@ import baselines
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.hardware.buses.bus import States
 from elastic_env.hardware.emulator.launch import EmulatorConfig, RunningEmulator
-from elastic_env.hardware.errors import HardwareError, PortError
+from elastic_env.hardware.errors import HardwareError
 from elastic_env.hardware.imu import Attitude, AttitudeError, AttitudeStream, SharedSample
 from elastic_env.hardware.live import plant
 from elastic_env.hardware.safety import realtime
@@ -115,28 +116,7 @@ def test_hardware_has_the_spaces_the_keys_and_the_motion_of_the_simulation(
     assert emulator.state()["torque_on"] == [False]
 
 
-def test_without_an_imu_the_link_is_unknown(emulator: RunningEmulator) -> None:
-    """Catches an encoder that is passed off as the link's angle, and a torque that is passed off
-    as measured; and a port that is opened for a step outside an episode."""
-    env = make_hardware(emulator)
-    env.reset()
-    _, reward, _, _, info = env.step(np.zeros(1, dtype=np.float32))
-    unknown = {"link_angle", "link_angle_imu", "link_error", "link_error_imu", "deflection"}
-    assert {name for name in unknown if not np.isnan(info[name])} == set()
-    assert np.isnan(reward)
-    assert np.isfinite([info["joint_torque"], info["servo_error"], info["time_s"]]).all()
-    with pytest.raises(HardwareError, match="no truth"):
-        env.unwrapped.truth()
-    env.close()
-    assert emulator.state()["torque_on"] == [False]
-    emulator.events()
-    with pytest.raises(
-        HardwareError, match=rf"no episode is under way at {emulator.port}.* reset\(\)"
-    ):
-        env.step(np.zeros(1, dtype=np.float32))
-    assert emulator.events() == []
-
-
+@pytest.mark.slow
 def test_a_link_that_turns_against_its_motor_stops_the_motion(emulator: RunningEmulator) -> None:
     """Catches an IMU whose sign is wrong, by which a policy would be scored and identification
     would fit K."""
@@ -167,31 +147,6 @@ def test_a_testbed_that_is_forgotten_lets_go(emulator: RunningEmulator) -> None:
     again.close()
 
 
-def test_nothing_moves_unless_somebody_agrees(emulator: RunningEmulator) -> None:
-    """Catches a motion that begins in a pipeline or a notebook without anybody there."""
-    emulator.events()
-    with pytest.raises(HardwareError, match="agree"):
-        make_hardware(emulator, confirm=True).reset()
-    assert emulator.events() == []
-
-
-def test_a_reference_beyond_the_limits_is_refused_before_anything_moves(
-    emulator: RunningEmulator,
-) -> None:
-    """Catches an episode that would be cut off by the limits half-way."""
-    with pytest.raises(HardwareError, match="limits allow"):
-        make_hardware(emulator, limits={"lowest_rad": -0.05})
-    for wrong, words in (
-        ({"prot": 1}, "port"),
-        ({"scenario": "soft"}, "simulation"),
-        ({"form": "rigid"}, "form"),
-    ):
-        with pytest.raises(
-            ConfigurationError if "prot" in wrong or "form" in wrong else HardwareError, match=words
-        ):
-            make_hardware(emulator, **wrong)
-
-
 @pytest.mark.slow
 def test_a_stalled_imu_ends_the_episode_with_torque_off(emulator: RunningEmulator) -> None:
     """Catches an old attitude that is used as a new one."""
@@ -208,21 +163,6 @@ def _step_for(env: Any, duration_s: float) -> None:
     begin = time.monotonic()
     while time.monotonic() - begin < duration_s:
         env.step(np.zeros(1, dtype=np.float32))
-
-
-def test_the_imus_stream_is_read_and_its_damaged_packets_are_not(emulator: RunningEmulator) -> None:
-    """Catches a wrong field or byte order, and a packet that is taken in spite of its checksum."""
-    with AttitudeStream(emulator.imu_port, oldest_s=0.5) as stream:
-        emulator.faults(imu_corrupted=0.5)
-        rolls = []
-        for _ in range(40):
-            time.sleep(0.01)
-            rolls.append(stream.latest().roll)
-    assert (
-        np.abs(np.array(rolls) - emulator.state()["q"][0]).max() < 0.01
-    )  # offset and noise of the scenario
-    with pytest.raises(PortError, match="/dev/ttyNOTHING: there is no such device"):
-        AttitudeStream("/dev/ttyNOTHING")
 
 
 def test_a_sample_whose_writer_died_within_is_none() -> None:
@@ -258,6 +198,7 @@ class StillBus:
     def __init__(self) -> None:
         self.now_s = 0.0
         self.goal = 0.0
+        self.is_closed = False
 
     def monotonic(self) -> float:
         return self.now_s
@@ -266,7 +207,7 @@ class StillBus:
         pass
 
     def close(self) -> None:
-        pass
+        self.is_closed = True
 
     def enable(self, limits: Any) -> Any:
         return np.zeros(1)
@@ -299,11 +240,88 @@ def still(monkeypatch: pytest.MonkeyPatch) -> StillBus:
     return bus
 
 
-def make_still() -> Any:
-    given = {"reference": QUICK, "confirm": False, "approach_rad_s": 2.0}
+def make_still(**arguments: Any) -> Any:
+    given = {"reference": QUICK, "confirm": False, "approach_rad_s": 2.0} | arguments
     return gymnasium.make(
         "elastic_env/HardwareTestbed-v0", disable_env_checker=True, port="still", **given
     )
+
+
+def refuse_ports(monkeypatch: pytest.MonkeyPatch) -> None:
+    """From now on whoever opens a port fails the test."""
+    for name in ("SupervisedBus", "AttitudeStream"):
+        monkeypatch.setattr(plant, name, lambda *_: pytest.fail("a port was opened"))
+
+
+def test_without_an_imu_the_link_is_unknown(
+    still: StillBus, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches an encoder that is passed off as the link's angle, and a torque that is passed off
+    as measured; and a port that is opened for a step outside an episode."""
+    env = make_still()
+    env.reset()
+    _, reward, _, _, info = env.step(np.zeros(1, dtype=np.float32))
+    unknown = {"link_angle", "link_angle_imu", "link_error", "link_error_imu", "deflection"}
+    assert {name for name in unknown if not np.isnan(info[name])} == set()
+    assert np.isnan(reward)
+    assert np.isfinite([info["joint_torque"], info["servo_error"], info["time_s"]]).all()
+    with pytest.raises(HardwareError, match="no truth"):
+        env.unwrapped.truth()
+    assert not still.is_closed
+    env.close()
+    assert still.is_closed
+    refuse_ports(monkeypatch)
+    with pytest.raises(HardwareError, match=r"no episode is under way at still.* reset\(\)"):
+        env.step(np.zeros(1, dtype=np.float32))
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_link_that_turns_against_its_motor_is_no_reset(
+    still: StillBus, monkeypatch: pytest.MonkeyPatch, sign: int
+) -> None:
+    """Catches an IMU whose sign is wrong, by which a policy would be scored and identification
+    would fit K; and a motion that this does not end."""
+    attitude = lambda: Attitude(still.now_s, still.goal, 0.0, 0.0)  # noqa: E731
+    imu = SimpleNamespace(latest=attitude, close=lambda: None)
+    monkeypatch.setattr(plant, "AttitudeStream", lambda *_: imu)
+    hold = {"kind": "hold", "lower": -0.5}
+    env = make_still(imu_port="imu", imu_sign=sign, reference=hold)
+    if sign == 1:
+        env.reset()
+        assert not still.is_closed
+        env.close()
+        return
+    with pytest.raises(HardwareError, match="imu_sign"):
+        env.reset()
+    assert still.is_closed
+
+
+def test_nothing_moves_unless_somebody_agrees(
+    still: StillBus, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches a motion that begins in a pipeline or a notebook without anybody there."""
+    refuse_ports(monkeypatch)
+    with pytest.raises(HardwareError, match="agree"):
+        make_still(confirm=True).reset()
+    assert still.now_s == 0.0
+
+
+def test_a_reference_beyond_the_limits_is_refused_before_anything_moves(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Catches an episode that would be cut off by the limits half-way."""
+    refuse_ports(monkeypatch)
+    with pytest.raises(HardwareError, match="limits allow"):
+        make_still(limits={"lowest_rad": -0.05})
+    for wrong, words in (
+        ({"prot": 1}, "port"),
+        ({"scenario": "soft"}, "simulation"),
+        ({"form": "rigid"}, "form"),
+    ):
+        with pytest.raises(
+            ConfigurationError if "prot" in wrong or "form" in wrong else HardwareError, match=words
+        ):
+            make_still(**wrong)
 
 
 def test_the_first_step_may_come_any_time_after_the_reset(still: StillBus) -> None:

@@ -25,7 +25,7 @@ PLAYED = [
     "ideal",
     "ideal+soft",
     "ideal+payload",
-    *(["ideal+slope"] * 4),
+    *(["ideal+slope"] * 2),
 ]
 """A scenario for every world."""
 
@@ -45,7 +45,7 @@ def walker(scenario: Any, num_envs: int = 2) -> Any:
 
 @cache
 def all_observed() -> Array:
-    """Estimates at the end of a compensated walk in all worlds, (7, 9)."""
+    """Estimates at the end of a compensated walk in all worlds, (5, 9)."""
     num_envs = len(PLAYED)
     env = walker(PLAYED, num_envs)
     policy = baselines.make("input_output", env)

@@ -727,6 +727,7 @@ call_mujoco(lambda: mujoco.MjSpec.from_string(text), "the model", "read")
 """
 
 
+@pytest.mark.slow
 def test_ctrl_c_reaches_a_long_compilation() -> None:
     """Catches MuJoCo in the main thread, which hears no signal for minutes."""
     process = subprocess.Popen(

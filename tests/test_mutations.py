@@ -34,16 +34,19 @@ LONGEST_S = 300
 MOST_BYTES = 2 * 10**9
 
 
-@pytest.mark.parametrize("cases", [200, pytest.param(2000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    ("cases", "short_walks"), [(200, True), pytest.param(2000, False, marks=pytest.mark.slow)]
+)
 def test_mutated_configurations_and_folders_are_taken_or_refused(
-    tmp_path: Path, cases: int
+    tmp_path: Path, cases: int, short_walks: bool
 ) -> None:
     """Catches a traceback, more than 2 GB, a case that does not end, and a file outside of the
     working folder."""
     limit = (
         f"import resource; resource.setrlimit(resource.RLIMIT_DATA, ({MOST_BYTES}, {MOST_BYTES}))"
     )
-    code = f"{limit}; from tests.mutations import main; raise SystemExit(main(0, {cases}) > 0)"
+    call = f"main(0, {cases}, short_walks={short_walks})"
+    code = f"{limit}; from tests.mutations import main; raise SystemExit({call} > 0)"
     (tmp_path / "tmp").mkdir()
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "TMPDIR": str(tmp_path / "tmp")}
     played = subprocess.run(

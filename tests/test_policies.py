@@ -129,11 +129,8 @@ def test_vector_actions_are_the_scalar_ones_row_by_row(variant: str) -> None:
 @pytest.mark.parametrize(
     "name",
     [
-        "zero",
-        AT_NIGHT,
         "input",
-        pytest.param("dynamic", marks=pytest.mark.slow),
-        pytest.param("oracle", marks=pytest.mark.slow),
+        *(pytest.param(n, marks=pytest.mark.slow) for n in NAMES if n != "input"),
     ],
 )
 def test_evaluate_policy_of_sb3_gives_the_return_of_a_plain_loop(name: str) -> None:

@@ -271,6 +271,7 @@ def test_a_copy_goes_on(copied: Any) -> None:
         np.testing.assert_array_equal(env.step(action)[0], twin.step(action)[0])
 
 
+@pytest.mark.slow
 def test_worlds_of_a_vector_are_the_scalar_ones() -> None:
     """Catches a world that depends on its neighbours."""
     arguments = {

@@ -323,7 +323,7 @@ def test_a_quantity_reaches_its_ends_and_leaves_all_others_as_they_are(name: str
 # The plant.
 
 
-@pytest.mark.parametrize("worlds", [1, 2])
+@pytest.mark.parametrize("worlds", [pytest.param(1, marks=pytest.mark.slow), 2])
 def test_a_drawn_robot_accelerates_as_one_that_is_compiled_with_its_values(worlds: int) -> None:
     """Catches a field that is forgotten, such as inertias for the contacts after a change of
     mass."""
@@ -641,6 +641,7 @@ def test_a_robot_walks_again_under_other_noise() -> None:
     assert not np.array_equal(first, again)
 
 
+@pytest.mark.slow
 def test_checkers_of_gymnasium_and_stable_baselines3_find_nothing(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -46,8 +46,8 @@ def test_scenarios_that_draw_nothing_are_known_by_their_episodes(scenario: str) 
         {"mounting_rad": 1e-3},
         {"floor_friction": 0.3},
         {"homing_rad": (-1e-3, 1e-3)},
-        {"joint_stiffness": (0.7, 1.3)},
-        {"floor_friction": (0.3, 1.0)},
+        pytest.param({"joint_stiffness": (0.7, 1.3)}, marks=pytest.mark.slow),
+        pytest.param({"floor_friction": (0.3, 1.0)}, marks=pytest.mark.slow),
         {"load_kg": (1.0, 2.0)},
         {"delay_share": 0.5},
         {"slope_rad": 0.01},
@@ -55,7 +55,7 @@ def test_scenarios_that_draw_nothing_are_known_by_their_episodes(scenario: str) 
         {"pelvis_imu": AttitudeSensor(bias_rad=1e-3)},
         {"inertial_share": 1.0},
     ],
-    ids=lambda alone: "-".join(alone),
+    ids="-".join,
 )
 def test_whatever_a_walk_draws_makes_its_scenario_random(alone: dict[str, Any]) -> None:
     """Catches a kind of noise or a drawn robot that is forgotten where ceilings are told from

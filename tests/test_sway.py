@@ -147,7 +147,11 @@ def test_a_trunk_on_massless_legs_sways_sideways_as_an_inverted_pendulum(stiffne
 
 @pytest.mark.parametrize(
     ("axis", "number", "contact_time_s", "tolerance"),
-    [(0, 0, None, 0.05), (0, 0, 0.002, 0.02), (1, 1, 0.002, 0.02)],
+    [
+        pytest.param(0, 0, None, 0.05, marks=pytest.mark.slow),
+        (0, 0, 0.002, 0.02),
+        (1, 1, 0.002, 0.02),
+    ],
     ids=["forwards", "forwards on a hard floor", "sideways on a hard floor"],
 )
 def test_the_simulated_robot_sways_with_these_frequencies(

@@ -22,6 +22,7 @@ from baselines.residual.true_robot import truth_of
 from baselines.residual_env import ResidualVectorWrapper
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.robots.thormang.environment import make as make_walk
+from tests.test_training import interrupted_after
 from train.learn.export import export_zip
 from train.learn.train_config import TrainConfig, training_worlds
 from train.learn.training import Training
@@ -141,9 +142,9 @@ CRITIC: dict[str, Any] = {
     "scenarios": ["drawn"],
     "base": "foothold",
     "worlds": 2,
-    "decisions": 16,
-    "evaluate_every": 16,
-    "checkpoint_every": 16,
+    "decisions": 32,
+    "evaluate_every": 32,
+    "checkpoint_every": 32,
     "evaluation_episodes": 1,
     "env_options": {"num_steps": 1},
     "settings": {"observe": ["clock.swing", "standing", "landing"], "mirror": True},
@@ -156,7 +157,8 @@ def test_the_truth_that_a_critic_sees_is_none_of_the_residual(tmp_path: Path) ->
     """Catches an actor that reads the truth, an export of other columns, and a critic that does
     not see it."""
     training = Training(TrainConfig(**CRITIC), 0, tmp_path, threads=1)
-    training.run()
+    with pytest.raises(KeyboardInterrupt):
+        training.run(interrupted_after(16))  # before its policy is played
     policy = training.model.policy
     seen = np.random.default_rng(0).normal(size=(5, 10 + 5)).astype(np.float32)
     other = seen.copy()
@@ -168,7 +170,7 @@ def test_the_truth_that_a_critic_sees_is_none_of_the_residual(tmp_path: Path) ->
         )
     assert torch.equal(*actions)
     assert not torch.allclose(*values)
-    description, network = load_residual(tmp_path / "last")
+    description, network = load_residual(training._keep_policy("last"))
     assert network.num_features == 10
     assert description.settings.privileged == ()
     statistics = training.model.get_vec_normalize_env().obs_rms
@@ -180,18 +182,15 @@ def test_the_truth_that_a_critic_sees_is_none_of_the_residual(tmp_path: Path) ->
 
 def test_a_critic_sees_the_true_robot_in_the_mirror_where_the_actor_is() -> None:
     """Catches truth of other worlds, and a load that hangs on the other side of a mirrored step."""
-    worlds = training_worlds(TrainConfig(**CRITIC), [("drawn", 4)], 1)
+    config = TrainConfig(**{**CRITIC, "env_options": {"num_steps": 2}})
+    worlds = training_worlds(config, [("drawn", 2)], 1)
     features, _ = worlds.reset(seed=0)
     truth = worlds.unwrapped.envs[0].truth()
     assert worlds.actor_features == 10
     np.testing.assert_array_equal(features[:, 10:], np.hstack([truth.load, truth.mounting]))
-    two = training_worlds(
-        TrainConfig(**{**CRITIC, "env_options": {"num_steps": 2}}), [("drawn", 4)], 1
-    )
-    two.reset(seed=0)
     for _ in range(19):  # into the second step, which stands on the right foot
-        features, *_ = two.step(np.zeros(two.action_space.shape))
-    truth = two.unwrapped.envs[0].truth()
+        features, *_ = worlds.step(np.zeros(worlds.action_space.shape))
+    truth = worlds.unwrapped.envs[0].truth()
     mirrored = np.hstack([truth.load * [1, 1, -1], truth.mounting * [-1, 1]])
     np.testing.assert_array_equal(features[:, 10:], mirrored)
 

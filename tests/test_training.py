@@ -129,6 +129,19 @@ def interrupted_after(decisions: int) -> Callable[[int], None]:
     return progress
 
 
+BEGUN = TrainConfig(**{**SMALL, **PPO, "checkpoint_every": 16})
+
+
+@pytest.fixture(scope="module")
+def begun(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A training that was interrupted behind its first checkpoint, before any evaluation but that
+    of the base."""
+    folder = tmp_path_factory.mktemp("begun")
+    with pytest.raises(KeyboardInterrupt):
+        Training(BEGUN, 1, folder).run(interrupted_after(16))
+    return folder
+
+
 @pytest.mark.parametrize(
     "options", [PPO, pytest.param(SAC, marks=pytest.mark.slow)], ids=["PPO", "SAC"]
 )
@@ -195,7 +208,7 @@ def test_episodes_that_checkpoints_end_have_their_reward_per_decision(
     """Catches a curve without a point, as every checkpoint ends the episodes before one is whole,
     and a last point of fewer decisions than the others."""
     settings = {"decision_period": 44, "history": 1}
-    sizes = {"decisions": 80, "checkpoint_every": 32}
+    sizes = {"worlds": 2, "decisions": 40, "checkpoint_every": 16, "evaluate_every": 40}
     training = Training(TrainConfig(**{**SMALL, **PPO, **sizes, "settings": settings}), 1, tmp_path)
     rewards = []
     step = training._worlds.env.step
@@ -210,8 +223,8 @@ def test_episodes_that_checkpoints_end_have_their_reward_per_decision(
     events = EventAccumulator(str(tmp_path / "tensorboard")).Reload()
     shown = [(event.step, event.value) for event in events.Scalars("rollout/reward_per_decision")]
     assert shown == [
-        (32, pytest.approx(np.mean(rewards[:8]), rel=1e-6)),
-        (64, pytest.approx(np.mean(rewards[8:16]), rel=1e-6)),
+        (16, pytest.approx(np.mean(rewards[:8]), rel=1e-6)),
+        (32, pytest.approx(np.mean(rewards[8:16]), rel=1e-6)),
     ]
     assert shown[0][1] < 0.0
 
@@ -246,19 +259,19 @@ def spoilt(worlds: SB3VecEnv, after: int, part: int, monkeypatch: pytest.MonkeyP
 
 @pytest.mark.parametrize(("part", "quantity"), [(0, "the observation"), (1, "the reward")])
 def test_nan_ends_a_training_with_one_sentence(
-    part: int, quantity: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    part: int, quantity: str, begun: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """Catches a traceback of torch, a checkpoint that holds nan, and one that is lost."""
-    config = TrainConfig(**{**SMALL, **PPO, "checkpoint_every": 16})
-    training = Training(config, 1, tmp_path)
-    spoilt(training._worlds, 5, part, monkeypatch)
+    folder = Path(shutil.copytree(begun, tmp_path / "run"))
+    training = Training(BEGUN, 1, folder)
+    spoilt(training._worlds, 1, part, monkeypatch)
     message = (
         rf"{quantity} is not a finite number at decision 2\d of training seed 1; the checkpoint of"
         r" decision 16 is"
     )
     with pytest.raises(ElasticError, match=message):
         training.run()
-    assert Training(config, 1, tmp_path).done == 16
+    assert Training(BEGUN, 1, folder).done == 16
 
 
 @pytest.mark.parametrize(
@@ -330,23 +343,19 @@ def test_a_search_whose_reward_is_nan_says_so(
         search.run()
 
 
-def test_a_damaged_checkpoint_is_named(tmp_path: Path) -> None:
+def test_a_damaged_checkpoint_is_named(begun: Path, tmp_path: Path) -> None:
     """Catches errors of libraries in the place of one that says which files, and what to do."""
-    config = TrainConfig(**{**SMALL, **PPO, "checkpoint_every": 16})
-    with pytest.raises(KeyboardInterrupt):
-        Training(config, 1, tmp_path / "whole").run(interrupted_after(16))
-    for file in ("model.pt", "state.json", "state.npz"):
-        for size in (None, 0, 100):
-            folder = Path(shutil.copytree(tmp_path / "whole", tmp_path / f"{file} {size}"))
-            damaged = folder / "checkpoint" / file
-            if size is None:
-                damaged.unlink()
-            else:
-                damaged.write_bytes(damaged.read_bytes()[:size])
-            with pytest.raises(
-                ElasticError, match=r"checkpoint is damaged or incomplete .*; remove it"
-            ):
-                Training(config, 1, folder)
+    for file, size in (("model.pt", None), ("state.json", 0), ("state.npz", 100)):
+        folder = Path(shutil.copytree(begun, tmp_path / file))
+        damaged = folder / "checkpoint" / file
+        if size is None:
+            damaged.unlink()
+        else:
+            damaged.write_bytes(damaged.read_bytes()[:size])
+        with pytest.raises(
+            ElasticError, match=r"checkpoint is damaged or incomplete .*; remove it"
+        ):
+            Training(BEGUN, 1, folder)
 
 
 @pytest.mark.slow
@@ -372,16 +381,13 @@ def test_a_killed_training_goes_on(tmp_path: Path) -> None:
     assert read_progress(killed) == read_progress(whole)
 
 
-def test_before_its_first_decision_a_residual_is_scored_as_what_it_is(tmp_path: Path) -> None:
+def test_before_its_first_decision_a_residual_is_scored_as_what_it_is(begun: Path) -> None:
     """Catches a beginning that is far from the base, whose score is taken for it without
     playing."""
-    config = TrainConfig(**{**SMALL, **PPO})
-    with pytest.raises(KeyboardInterrupt):
-        Training(config, 1, tmp_path).run(interrupted_after(1))
-    (row,) = read_progress(tmp_path)
+    (row,) = read_progress(begun)
     assert row["decisions"] == 0
     metric = "link_error_rms_rad"
-    ((found,),), failed = play_scenarios(config, f"residual:{tmp_path / 'best'}", [metric])
+    ((found,),), failed = play_scenarios(BEGUN, f"residual:{begun / 'best'}", [metric])
     assert not failed.any()
     assert row[metric] == row[f"base_{metric}"] == pytest.approx(found, rel=2e-5)
     assert found != row[metric]
@@ -461,7 +467,7 @@ def test_a_mixture_is_its_parts() -> None:
     np.testing.assert_array_equal(observation, alone)
     generator = np.random.default_rng(2)
     ends = 0
-    for _ in range(50):
+    for _ in range(42):  # an episode has 38 decisions
         residual = generator.uniform(-1.0, 1.0, (3, 1))
         observation, reward, terminated, truncated, info = whole.step(residual)
         results = [parts[0].step(residual[:2]), parts[1].step(residual[2:])]
@@ -662,17 +668,12 @@ def test_train_command_trains_every_seed_and_resumes(
     monkeypatch: pytest.MonkeyPatch,
     tmp_path: Path,
 ) -> None:
-    """Catches a seed left out, seeds that differ side by side, policies without a player, a
-    resume that begins anew."""
+    """Catches a seed left out or trained twice, policies without a player, a resume that begins
+    anew."""
     monkeypatch.chdir(tmp_path)
     given = {"name": "mine", **SMALL, **PPO, "seeds": [3, 4], "worlds": 2, "decisions": 16}
     Path("c.yaml").write_text(yaml.safe_dump(given))
     main(["train", "c.yaml", "--jobs", jobs])
-    Training(TrainConfig(**given), 4, tmp_path / "alone").run()
-    for name, tensor in weights(tmp_path / "alone" / "last").items():
-        np.testing.assert_array_equal(
-            tensor, weights(tmp_path / "runs/mine/seed_4/last")[name], err_msg=name
-        )
     assert "elastic train --resume runs/mine" in capsys.readouterr().out
     for seed in (3, 4):
         description, _ = load_residual(Path(f"runs/mine/seed_{seed}/last"))
@@ -681,6 +682,7 @@ def test_train_command_trains_every_seed_and_resumes(
             "nominal"
         }
     before = (Path("runs/mine/seed_3/last/weights.safetensors")).read_bytes()
+    assert Path("runs/mine/seed_4/last/weights.safetensors").read_bytes() != before
     main(["train", "--resume", "runs/mine"])
     assert "runs/mine is complete" in capsys.readouterr().out
     assert Path("runs/mine/seed_3/last/weights.safetensors").read_bytes() == before
@@ -693,8 +695,8 @@ def test_train_command_trains_every_seed_and_resumes(
 def test_several_configurations_are_trained_in_one_pool(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """Catches configurations that wait for one another, a seed in the folder of another, a
-    resume of one alone."""
+    """Catches configurations that wait for one another, a seed in the folder of another or that
+    differs side by side, a resume of one alone."""
     monkeypatch.chdir(tmp_path)
     pools = list[int]()
     opened = Executors.open_pool
@@ -728,6 +730,11 @@ def test_several_configurations_are_trained_in_one_pool(
     for name in configs:
         description, _ = load_residual(Path(f"both/{name}/seed_3/last"))
         assert description.base == configs[name]["base"]
+    Training(TrainConfig(**configs["b"]), 3, tmp_path / "alone").run()
+    for name, tensor in weights(tmp_path / "alone" / "last").items():
+        np.testing.assert_array_equal(
+            tensor, weights(Path("both/b/seed_3/last"))[name], err_msg=name
+        )
     capsys.readouterr()
     main(["train", "--resume", "both/a", "both/b"])
     said = capsys.readouterr().out

@@ -121,7 +121,7 @@ STILL = {"kind": "sine", "amplitude": 1e-9, "duration_s": 0.25, "onset_s": 1.0}
 MOVING = {"kind": "sine", "amplitude": 0.4, "frequency_hz": 0.6, "duration_s": 1.5, "onset_s": 0.5}
 
 
-@pytest.mark.parametrize("integral_gain", [0.0, 8000.0])
+@pytest.mark.parametrize("integral_gain", [pytest.param(0.0, marks=pytest.mark.slow), 8000.0])
 def test_at_rest_input_takes_the_sag_away(integral_gain: float) -> None:
     """Catches a compensator that leaves the sag of the servo, or compensates a weight that
     gravcomp carries."""
@@ -130,7 +130,7 @@ def test_at_rest_input_takes_the_sag_away(integral_gain: float) -> None:
     assert errors("input", "ideal", integral_gain, home, STILL) < 0.01 * sag
 
 
-@pytest.mark.parametrize("integral_gain", [0.0, 8000.0])
+@pytest.mark.parametrize("integral_gain", [0.0, pytest.param(8000.0, marks=pytest.mark.slow)])
 def test_in_motion_dynamic_takes_the_error_away(integral_gain: float) -> None:
     """Catches springs, gravcomp or servo sag that inverse dynamics forget."""
     home = (0.2, 0.1, -0.3)

@@ -24,7 +24,6 @@ from typing import Any, Self
 import mujoco
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.linalg import get_lapack_funcs
 
 from baselines.compensation.command_warnings import CommandWarnings
 from baselines.compensation.dry_friction import FrictionCompensation
@@ -62,8 +61,6 @@ _FAR_RAD = 0.5
 _LAST_RESIDUAL_RAD = 1e-12
 _SAME_RAD = 1e-6
 """Largest distance of two results that count as one equilibrium [rad]."""
-# without the checks of lu_factor, which take longer
-_lu_factor, _lu_solve = get_lapack_funcs(("getrf", "getrs"))
 
 
 @dataclass(frozen=True)
@@ -189,6 +186,10 @@ class PositionCompensator:
             fastest=np.array([j.servo.fastest for j in settings]),
             rotor_s2=np.array([j.rotor_inertia or 0.0 for j in settings]) / gains,
         )
+        from scipy import linalg  # late, see `elastic_env.motion.preview_control`
+
+        # without the checks of lu_factor, which take longer
+        self._lu_factor, self._lu_solve = linalg.get_lapack_funcs(("getrf", "getrs"))
         self._warnings = CommandWarnings(self.joints, lowest, highest, limits.limit_rad)
         self.reset()
         torque = largest_gravity_torque(self.constants.body, lowest, highest)
@@ -327,13 +328,13 @@ class PositionCompensator:
         jacobian.flat[:: len(encoder) + 1] += 1.0
         # as `static_link_angle`, but by 1/K, so that a joint may be rigid, and with the gradient at
         # θ alone, for speed; the first step is Eq. 12
-        factors, pivots, is_singular = _lu_factor(jacobian)
+        factors, pivots, is_singular = self._lu_factor(jacobian)
         if is_singular:
             return self._soft_link_angle(encoder, None)
         q = encoder
         for _ in range(_MAX_ITERATIONS):
             residual = q - encoder + compliance * self._joint_torque_at_rest(q)
-            step, _ = _lu_solve(factors, pivots, residual)
+            step, _ = self._lu_solve(factors, pivots, residual)
             q = q - step
             squared = residual.dot(residual)
             if squared < _LAST_STEP_RAD**2:

@@ -26,7 +26,6 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy import linalg
 
 from baselines.compensation.compiled_rows import record_row, record_rows
 from baselines.compensation.contact_torque import cosine_and_sine
@@ -52,6 +51,8 @@ def center_of_mass_shift(zmp: Array, omega: float, period_s: float) -> Array:
     Returns:
         (T, k) [m]; its second difference fulfils the equation of the module.
     """
+    from scipy import linalg  # late, see `elastic_env.motion.preview_control`
+
     stiff = 1.0 / (omega * period_s) ** 2
     bands = np.tile([[-stiff], [1.0 + 2.0 * stiff], [-stiff]], len(zmp))
     bands[1, [0, -1]] = 1.0 + stiff

@@ -12,7 +12,6 @@ discrete-time system subject to previewable demand", Int. J. Control 41(3).
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import linalg
 
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.errors import ElasticError
@@ -66,6 +65,9 @@ def cart_table(config: PreviewConfig) -> tuple[Array, Array, Array]:
 
 def preview_gains(config: PreviewConfig) -> PreviewGains:
     """Compute optimal gains by the Riccati equation of the incremental system [Katayama1985]."""
+    # imported late: it takes a tenth of a second, and only walks need it
+    from scipy import linalg
+
     A, b, c = cart_table(config)
     Phi = np.block([[np.ones((1, 1)), (c @ A)[None]], [np.zeros((3, 1)), A]])
     G = np.concatenate([[c @ b], b])[:, None]

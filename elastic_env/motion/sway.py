@@ -7,7 +7,6 @@ angles q(x). About the equilibrium, with the motors at θ = q + K⁻¹τ,
 """  # noqa: E501
 
 import numpy as np
-from scipy import linalg
 
 from elastic_env.core.signals import Array
 from elastic_env.rigid import leg_kinematics as legs
@@ -33,6 +32,8 @@ def sway_frequencies(
         The six angular frequencies, ascending, (6,) [rad/s]; nan for one that gravity makes
         unstable.
     """
+    from scipy import linalg  # late, see `elastic_env.motion.preview_control`
+
     feet = biped.ankles if ankles is None else ankles
 
     def angles_at(x: Array) -> Array:
