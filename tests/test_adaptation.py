@@ -152,7 +152,12 @@ def correction(state: Any) -> Array:
 
 
 @pytest.mark.parametrize(
-    ("name", "joints"), [("adaptive", [1]), ("torque_sensor", [1]), ("link_encoder", [1, 3])]
+    ("name", "joints"),
+    [
+        ("adaptive", [1]),
+        pytest.param("torque_sensor", [1], marks=pytest.mark.slow),
+        ("link_encoder", [1, 3]),
+    ],
 )
 def test_softer_joints_are_found_out(name: str, joints: list[int]) -> None:
     """K × 0.7 bends 0.43 more; asked of the joints that carry most, hip roll and knee."""
@@ -243,7 +248,7 @@ def test_other_gains_leave_the_weight_measured() -> None:
     """Catches a gain of the feedback that turns off the measurement of the weight, unseen."""
     env = gymnasium.make("elastic_env/WalkInPlace-v0", scenario="ideal+payload")
     last = []
-    for gains in (None, {"dcm": 0.4}, {"weight_filter_s": 1.0}, {"weight_filter_s": None}):
+    for gains in (None, {"dcm": 0.4}, {"weight_filter_s": None}):
         policy = baselines.make("adaptive_posture", env, gains=gains)
         state = None
         observation, _ = env.reset(seed=0)
@@ -252,5 +257,4 @@ def test_other_gains_leave_the_weight_measured() -> None:
             observation, *_ = env.step(action)
         last.append(action)
     np.testing.assert_array_equal(last[1], last[0])
-    np.testing.assert_array_equal(last[2], last[0])
-    assert not np.array_equal(last[3], last[0])
+    assert not np.array_equal(last[2], last[0])

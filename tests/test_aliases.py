@@ -11,8 +11,6 @@ import baselines
 import elastic_env
 import train
 
-ROOT = Path(__file__).parents[1]
-
 
 def test_the_packages_beside_are_reached_through_elastic_env() -> None:
     """Catches a second copy of a package, whose classes are not those of the first."""
@@ -26,19 +24,9 @@ def test_the_packages_beside_are_reached_through_elastic_env() -> None:
         elastic_env.trian  # noqa: B018  it is asked for
 
 
-def test_nothing_beside_is_imported_before_it_is_asked_for() -> None:
-    """Catches an environment that loads policies, and a cycle of imports."""
-    code = (
-        "import sys, elastic_env; print('baselines' in sys.modules, 'train' in sys.modules);"
-        " from elastic_env import baselines, train; print(baselines.make.__module__, train.__name__)"
-    )
-    run = subprocess.run(
-        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True
-    )
-    assert run.stdout.split() == ["False", "False", "baselines.policies", "train"]
-
-
-@pytest.mark.parametrize("shadow", ["baselines.py", "baselines/other.py"])
+@pytest.mark.parametrize(
+    "shadow", ["baselines.py", pytest.param("baselines/other.py", marks=pytest.mark.slow)]
+)
 def test_a_module_of_the_user_in_their_place_is_named(shadow: str, tmp_path: Path) -> None:
     """Catches a user's file that is taken for ours, or run before it is refused."""
     file = tmp_path / shadow

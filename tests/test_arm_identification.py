@@ -502,12 +502,13 @@ def test_a_joint_of_which_the_poses_say_nothing_is_rigid_for_every_reader() -> N
 def test_joints_that_are_not_sought_stand_in_the_file_as_rigid() -> None:
     """Catches a file that the compensator refuses, since it lacks joints that the docs call
     rigid."""
-    joints = ["--joints", "elbow", "wrist_*"]
-    run("--log", str(EXAMPLE), *joints, "--holdout", "0", "--output", "found")
-    stiffness = parse_yaml(Path("found/joints.yaml").read_text())
+    options = ArmOptions(log=[str(EXAMPLE)], joints=["elbow", "wrist_*"], end_effector="marker")
+    problem = ArmProblem.from_options(options, ARM, Console(), 0)
+    file = describe_fit(fit_arm(problem.model(problem.log)), 0.03, None).save(Path())[1]
+    stiffness = parse_yaml(file.read_text())
     assert set(stiffness) == set(JOINTS)
     assert stiffness["shoulder_pitch"] == {"stiffness": math.inf}
-    compensator = PositionCompensator.from_model(FOLDER / "arm.xml", "found/joints.yaml")
+    compensator = PositionCompensator.from_model(FOLDER / "arm.xml", file)
     q = np.full(7, 0.3)
     assert (compensator.command(q) == q).tolist() == [True, True, True, False, True, False, False]
     assert (

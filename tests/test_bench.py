@@ -21,6 +21,7 @@ from train.commands.cli import main
 from train.evaluate.conditions import Condition
 from train.evaluate.episodes import Evaluation, evaluate
 from train.runs.github_annotations import annotation
+from train.workers.executors import Executors
 
 ROOT = Path(__file__).parents[1]
 QUICK = {"kind": "sine", "duration_s": 0.1, "onset_s": 0.1, "amplitude": 0.1}
@@ -89,8 +90,8 @@ def test_what_was_accepted_is_kept_and_what_got_worse_falls_short(
     assert "falls short" in Path("summary.md").read_text()
 
 
-class OfTwoCases(NamedTuple):
-    """What came of `elastic bench` with two cases, which its worker processes play."""
+class OfCases(NamedTuple):
+    """What came of `elastic bench` with several cases, which a worker process plays."""
 
     said: list[str]
     folder: Path
@@ -98,19 +99,22 @@ class OfTwoCases(NamedTuple):
 
 
 @pytest.fixture(scope="module")
-def of_two_cases(tmp_path_factory: pytest.TempPathFactory) -> OfTwoCases:
-    """Play once for all tests of two cases."""
-    folder = tmp_path_factory.mktemp("two_cases")
+def of_cases(tmp_path_factory: pytest.TempPathFactory) -> OfCases:
+    """Play once for all tests of several cases: two of one motion, and one of another, whose worlds
+    they cannot share, so that they are played in a worker."""
+    folder = tmp_path_factory.mktemp("cases")
     kept = {"env": "testbed", "policy": "input", "reference": LONGER, "episodes": 2}
     kept["figures"] = {"link_error_rms_rad": 9.0, "link_error_peak_rad": 9.0}
     soft = {**kept, "options": {"stiffness_scale": 0.5}}
     soft["figures"] = {"link_error_rms_rad": 9.0, "link_error_peak_rad": 1e-4}
-    (folder / "bench.yaml").write_text(yaml.safe_dump({"cases": [kept, soft]}))
+    short = {**kept, "reference": {**LONGER, "duration_s": 0.4}}
+    short["figures"] = {"link_error_rms_rad": 9.0}
+    (folder / "bench.yaml").write_text(yaml.safe_dump({"cases": [kept, soft, short]}))
     evaluations: list[Evaluation] = []
     play = train.commands.bench.run_conditions
 
     def noted(conditions: Sequence[Condition], console: Console) -> list[Evaluation]:
-        evaluations.extend(play(conditions, console))
+        evaluations.extend(play(conditions, console, Executors(jobs=1)))
         return evaluations
 
     with pytest.MonkeyPatch.context() as patch, redirect_stdout(StringIO()) as said:
@@ -120,15 +124,15 @@ def of_two_cases(tmp_path_factory: pytest.TempPathFactory) -> OfTwoCases:
         patch.setenv("GITHUB_WORKSPACE", str(folder.parent))
         patch.setattr(train.commands.bench, "run_conditions", noted)
         assert failed(["bench.yaml"])
-    return OfTwoCases(said.getvalue().splitlines(), folder, evaluations)
+    return OfCases(said.getvalue().splitlines(), folder, evaluations)
 
 
-def test_what_falls_short_stands_first_and_is_an_annotation(of_two_cases: OfTwoCases) -> None:
+def test_what_falls_short_stands_first_and_is_an_annotation(of_cases: OfCases) -> None:
     """Catches a failure at the end of a long table, a change of the wrong sign, options that the
     policy does not get, and a file that is named as if the checkout were here."""
-    folder = of_two_cases.folder
+    folder = of_cases.folder
     begin = f"::error file={folder.name}/bench.yaml,title="
-    (error,) = (line for line in of_two_cases.said if line.startswith(begin))
+    (error,) = (line for line in of_cases.said if line.startswith(begin))
     assert "link_error_peak_rad is" in error
     figures = json.loads((folder / "runs/bench/bench.json").read_text())
     plain, scaled = (one["measured"] for one in figures if one["metric"] == "link_error_peak_rad")
@@ -144,10 +148,14 @@ def test_what_falls_short_stands_first_and_is_an_annotation(of_two_cases: OfTwoC
     assert all("-99.9 %" in line for line in rows[2:] if "link_error" in line)
 
 
-def test_figures_with_a_sign_are_judged_by_their_size(capsys: pytest.CaptureFixture[str]) -> None:
+def test_figures_with_a_sign_are_judged_by_their_size(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Catches a lowest error that grows tenfold and counts as better."""
     signed = partial(written, reference=LONGER)
     path = signed(figures={"link_error_min_rad": None, "clipped_share": None})
+    played = [evaluate(Condition(policy={"name": "input"}, reference=LONGER))]
+    monkeypatch.setattr(train.commands.bench, "run_conditions", lambda *_: played)
     assert not failed([str(path), "--update"])
     case = yaml.safe_load(path.read_text())["cases"][0]
     accepted = case["figures"]["link_error_min_rad"]
@@ -184,13 +192,13 @@ def test_an_update_fits_without_margin_and_changes_figures_alone(
 def test_an_update_refuses_figures_that_two_cases_share(
     named: tuple[str, str],
     case: str,
-    of_two_cases: OfTwoCases,
+    of_cases: OfCases,
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Catches figures of one case that take the place of another one's, which then falls short, and
     figures of another case that end in a traceback."""
-    played = of_two_cases.evaluations
+    played = of_cases.evaluations[:2]
     monkeypatch.setattr(train.commands.bench, "run_conditions", lambda *_: played)
     path = written()
     path.write_text(path.read_text().replace(*named, 1) + f"- {case}\n")
@@ -249,10 +257,8 @@ def test_figures_have_margins_of_their_own_and_are_means_over_episodes(
     path = written(figures=dict.fromkeys(names), episodes=3, seed=4)
     assert not failed([str(path), "--update"])
     accepted = yaml.safe_load(path.read_text())["cases"][0]["figures"]
-    alone = [
-        evaluate(Condition(policy={"name": "input"}, reference=QUICK, seed=seed)).episodes[0]
-        for seed in (4, 5, 6)
-    ]
+    condition = Condition(policy={"name": "input"}, reference=QUICK, seed=4, episodes=3)
+    alone = evaluate(condition).episodes
     for name in names:
         mean = sum(own[name] for own in alone) / 3.0
         assert accepted[name] == pytest.approx(mean, rel=1e-3)

@@ -32,6 +32,11 @@ CHECKED = f"{STRICT} -fno-sanitize-recover=undefined"
 QUICKLY = CHECKED.replace("-O1", "-O0")
 """As strict, and compiled in half the time."""
 RELEASED = "-std=c99 -O3 -Wall -Wextra -Wpedantic -Wconversion -Wshadow -Werror"
+AS_RELEASED = [
+    pytest.param(RELEASED.replace("-O3", "-O0"), id="quickly"),
+    pytest.param(RELEASED, id="released", marks=pytest.mark.slow),
+]
+"""With all warnings on every commit, and optimized at night."""
 COMPILERS = {"gcc": ["gcc"]}
 if shutil.which("clang"):
     COMPILERS["clang"] = ["clang"]
@@ -276,12 +281,15 @@ def test_two_robots_fit_in_one_program_that_checks_them(compiler: str, tmp_path:
 
 
 @pytest.mark.parametrize("compiler", COMPILERS)
-def test_the_example_checks_and_times_the_header(compiler: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("options", AS_RELEASED)
+def test_the_example_checks_and_times_the_header(
+    options: str, compiler: str, tmp_path: Path
+) -> None:
     """Catches an example that does not compile, and one for another header."""
     (tmp_path / "robot.h").write_text(header := c_header(springs(), "arm"))
     made = c_example("arm", "arm", "robot.h")
     assert "add_executable(arm_main arm_main.c)" in made["CMakeLists.txt"]
-    program = compiled(tmp_path, header, compiler, made["arm_main.c"], RELEASED)
+    program = compiled(tmp_path, header, compiler, made["arm_main.c"], options)
     said = subprocess.run([program], capture_output=True, text=True, check=True).stdout
     assert said.startswith("largest deviation from Python: 0 rad")
     assert "us per command" in said

@@ -197,7 +197,10 @@ FILES: dict[str, Callable[[Path], Any]] = {
 }
 
 
-@pytest.mark.parametrize("name", FILES)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=pytest.mark.slow if name == "bomb" else ()) for name in FILES],
+)
 def test_a_file_that_is_no_cell_is_not_taken(name: str, file: Path) -> None:
     """Catches a traceback for, a wait for, or trust in, whatever lies under the name of a cell."""
     FILES[name](file)

@@ -12,13 +12,12 @@ from pathlib import Path
 import pytest
 
 from elastic_env.core.errors import ElasticError
-from tests.test_training import PPO, SMALL, interrupted_after
+from tests.test_training import BEGUN, PPO, SMALL, interrupted_after
 from train.learn.checkpoint import recover_checkpoint, require_complete, write_checkpoint
 from train.learn.train_config import TrainConfig
 from train.learn.training import Training
 from train.runs.failures import SYSTEM_FAILED, explain
 
-MUTATIONS = 300
 FULL_DISKS = 3
 
 
@@ -33,7 +32,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A training seed that was interrupted behind a checkpoint."""
     folder = tmp_path_factory.mktemp("trained")
     with pytest.raises(KeyboardInterrupt):
-        Training(TrainConfig(**{**SMALL, **PPO}), 1, folder).run(interrupted_after(48))
+        Training(BEGUN, 1, folder).run(interrupted_after(32))
     return folder
 
 
@@ -75,12 +74,15 @@ def replace(file: Path, chance: random.Random) -> None:
     shutil.copy(chance.choice(others), file)
 
 
-def test_a_mutated_checkpoint_is_refused_before_it_is_read(trained: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("mutations", [100, pytest.param(300, marks=pytest.mark.slow)])
+def test_a_mutated_checkpoint_is_refused_before_it_is_read(
+    mutations: int, trained: Path, tmp_path: Path
+) -> None:
     """Catches a file that is read without its digest, and a digest that misses some change."""
     chance = random.Random(26)
     path = tmp_path / "checkpoint"
     require_complete(trained / "checkpoint")
-    for _ in range(MUTATIONS):
+    for _ in range(mutations):
         shutil.copytree(trained / "checkpoint", path, dirs_exist_ok=True)
         file = chance.choice(sorted(path.iterdir()))
         mutate = chance.choice([flip, cut, repeat, renumber, remove, rename, replace])
@@ -118,7 +120,7 @@ def test_no_thread_goes_on_writing_behind_a_training_that_was_ended(tmp_path: Pa
     between other words."""
     before = set(threading.enumerate())
     with pytest.raises(KeyboardInterrupt):
-        Training(TrainConfig(**{**SMALL, **PPO}), 1, tmp_path).run(interrupted_after(32))
+        Training(BEGUN, 1, tmp_path).run(interrupted_after(32))
     assert [
         type(thread).__name__
         for thread in set(threading.enumerate()) - before

@@ -116,9 +116,9 @@ def link_motion(model: mujoco.MjModel, is_series: bool, duration_s: float) -> Ar
 )
 def test_tendon_and_series_form_move_alike(joint: ElasticJoint, bound: float) -> None:
     """Catches a spring, damper, friction or servo that acts on the wrong side in one of the
-    forms (5 s of motion)."""
-    tendon = link_motion(elastic_spec(PENDULUM, joint, "tendon", STEP_S).compile(), False, 5.0)
-    series = link_motion(series_model(joint), True, 5.0)
+    forms (3 s of motion)."""
+    tendon = link_motion(elastic_spec(PENDULUM, joint, "tendon", STEP_S).compile(), False, 3.0)
+    series = link_motion(series_model(joint), True, 3.0)
     assert np.ptp(tendon) > 0.9  # it did move
     assert np.abs(tendon - series).max() < bound
 
@@ -297,11 +297,9 @@ def test_the_servo_is_a_pid_on_the_rotor() -> None:
 # --------------------------------------------------------------------------------------------------
 
 
-def foreign_cases() -> list[object]:
+def foreign_cases() -> list[Any]:
     """All models with the hinges that become elastic; Gymnasium's with every hinge they have."""
-    cases: list[object] = [
-        pytest.param(xml, tuple(names), id=name) for name, (xml, names) in MODELS.items()
-    ]
+    cases = [pytest.param(xml, tuple(names), id=name) for name, (xml, names) in MODELS.items()]
     return cases + [pytest.param(path, None, id=path.stem) for path in ASSETS]
 
 
@@ -391,14 +389,20 @@ def elastic_from(
     return spec.compile(), make_elastic(spec, dict.fromkeys(chosen, joint), form).compile(), chosen
 
 
-FORMS_OF_ALL = [
-    pytest.param("tendon", id="tendon"),
-    pytest.param("rigid", id="rigid"),
+EVERY_FORM = [
+    pytest.param(
+        *case.values,
+        form,
+        id=f"{case.id}-{form}",
+        marks=[pytest.mark.slow] * (form == "rigid" and isinstance(case.values[0], Path)),
+    )
+    for form in ("tendon", "rigid")
+    for case in foreign_cases()
 ]
+"""Gymnasium's with rigid rotors at night: what a rotor may bring along is in the others."""
 
 
-@pytest.mark.parametrize("form", FORMS_OF_ALL)
-@pytest.mark.parametrize(("source", "names"), foreign_cases())
+@pytest.mark.parametrize(("source", "names", "form"), EVERY_FORM)
 @pytest.mark.filterwarnings("ignore:compiler attribute 'settotalmass' is deprecated")
 def test_total_mass_and_names_are_kept(
     source: str | Path, names: tuple[str, ...] | None, form: Form
@@ -439,8 +443,7 @@ def _element_names(model: mujoco.MjModel, kind: str) -> list[str]:
     return [getattr(model, kind)(i).name for i in range(count)]
 
 
-@pytest.mark.parametrize("form", FORMS_OF_ALL)
-@pytest.mark.parametrize(("source", "names"), foreign_cases())
+@pytest.mark.parametrize(("source", "names", "form"), EVERY_FORM)
 @pytest.mark.filterwarnings("ignore:compiler attribute 'settotalmass' is deprecated")
 def test_undeflected_dynamics_are_those_of_the_rigid_model(
     source: str | Path, names: tuple[str, ...] | None, form: Form
@@ -493,7 +496,15 @@ def test_sensors_contacts_and_limits_are_those_of_the_rigid_model(
     )
 
 
-@pytest.mark.parametrize(("source", "names"), foreign_cases())
+@pytest.mark.parametrize(
+    ("source", "names"),
+    [  # test_time_step.py moves Gymnasium's
+        pytest.param(
+            *case.values, id=case.id, marks=[pytest.mark.slow] * isinstance(case.values[0], Path)
+        )
+        for case in foreign_cases()
+    ],
+)
 @pytest.mark.filterwarnings("ignore:compiler attribute 'settotalmass' is deprecated")
 def test_foreign_models_run(source: str | Path, names: tuple[str, ...] | None) -> None:
     """Catches models that compile and then blow up."""

@@ -111,7 +111,7 @@ def test_a_force_sensor_that_is_off_does_not_let_the_feet_walk_away() -> None:
 
 def test_feet_do_not_walk_forward_by_what_their_shear_hides() -> None:
     """Catches a rate of the load that is left out, or has the sign of the other foot."""
-    steps = 20
+    steps = 14
     period_s = 1.1
     ends = []
     later = []

@@ -25,6 +25,10 @@ MOTIONS: dict[str, dict[str, Any]] = {
     "elastic_env/WalkInPlace-v0": {"step_period": [0.3, 0.4, 0.3], "num_steps": 1},
 }
 ROBOTS = pytest.mark.parametrize("robot", MOTIONS)
+ARM_AT_NIGHT = pytest.mark.parametrize(
+    "robot", [pytest.param(r, marks=[pytest.mark.slow] * ("Arm" in r)) for r in MOTIONS]
+)
+"""One class makes it and the testbed."""
 
 
 def made(robot: str, worlds: int = 2, **arguments: Any) -> Any:
@@ -94,7 +98,7 @@ def test_a_standing_walker_feels_its_weight() -> None:
     np.testing.assert_allclose(shown(env, observation, "accelerometer"), 9.81 * upwards, atol=1e-3)
 
 
-@ROBOTS
+@ARM_AT_NIGHT
 def test_what_is_not_asked_for_changes_nothing(robot: str) -> None:
     """Catches a sensor that draws from the noise of others, or disturbs the physics."""
     with_all = made(robot, scenario="nominal")
@@ -107,7 +111,7 @@ def test_what_is_not_asked_for_changes_nothing(robot: str) -> None:
     np.testing.assert_array_equal(one[:, :width], other)
 
 
-@ROBOTS
+@ARM_AT_NIGHT
 def test_their_errors_are_as_declared(robot: str) -> None:
     """Catches noise that is left out or drawn once, an offset per step, and worlds that share
     theirs."""
@@ -130,7 +134,7 @@ def test_their_errors_are_as_declared(robot: str) -> None:
     np.testing.assert_allclose(counts, np.rint(counts), atol=1e-6)
 
 
-@ROBOTS
+@ARM_AT_NIGHT
 def test_they_are_as_old_as_the_other_measurements(robot: str) -> None:
     """Catches a sensor that a delay leaves out."""
     env = made(robot, scenario="ideal+sensor")

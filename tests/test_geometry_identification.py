@@ -111,25 +111,24 @@ def test_a_rigid_nominal_arm_is_mujocos(model: mujoco.MjModel, geometry: Geometr
 def test_derivatives_are_difference_quotients(
     geometry: GeometryModel, axial: AxialTorques | None
 ) -> None:
-    """Catches a moment that does not change with a parameter, and a twist about a wrong point."""
+    """Catches a moment that does not change with a parameter, and a twist about a wrong point:
+    along three ways, in which all parameters of a kind change by other amounts."""
     generator, q = draw(1)
     parameters = some_parameters(generator)
     shown, gradient = marker_gradient(geometry, parameters, q, axial)
     np.testing.assert_array_equal(shown, geometry.predict_markers(parameters, q, axial))
     for kind, values in parameters._asdict().items():
         step = {"compliance": 1e-8, "friction": 1e-4}.get(kind, 1e-6)
-        for index in np.ndindex(values.shape):
-            more = values.copy()
-            less = values.copy()
-            more[index] += step
-            less[index] -= step
-            change = geometry.predict_markers(parameters._replace(**{kind: more}), q, axial)
-            change = change - geometry.predict_markers(
-                parameters._replace(**{kind: less}), q, axial
+        size = np.abs(getattr(gradient, kind)).max()
+        for way in generator.uniform(-1.0, 1.0, (3, *values.shape)):
+            more, less = (
+                geometry.predict_markers(
+                    parameters._replace(**{kind: values + sign * step * way}), q, axial
+                )
+                for sign in (1.0, -1.0)
             )
-            own = getattr(gradient, kind)[(..., *index)]
-            size = np.abs(getattr(gradient, kind)).max()
-            np.testing.assert_allclose(own, change / (2.0 * step), atol=1e-7 * size)
+            own = np.tensordot(getattr(gradient, kind), way, way.ndim)
+            np.testing.assert_allclose(own, (more - less) / (2.0 * step), atol=1e-7 * size)
 
 
 def test_deflection_about_the_axis_is_that_of_the_elastic_joint(geometry: GeometryModel) -> None:
@@ -168,14 +167,14 @@ def test_a_joint_that_gravity_almost_overcomes_still_rests(geometry: GeometryMod
         return float(softness * geometry.moments(rests)[0, 1, 2])
 
     rests, tips = 1e-3, 10.0
-    while tips - rests > 5e-4 * rests:
+    while tips - rests > 4e-3 * rests:
         softness = 0.5 * (rests + tips)
         try:
             turn(softness)
             rests = softness
         except ElasticError:
             tips = softness
-    near, nearer = 0.997 * rests, 0.998 * rests
+    near, nearer = 0.99 * rests, 0.994 * rests
     turned = turn(nearer)
     slope = (turned - turn(near)) / (nearer - near)
     kappa = 1.0 - turned / nearer / slope
@@ -241,7 +240,8 @@ def made_up(
 @pytest.mark.parametrize(
     "options",
     [
-        {"geometry": "dh"},
+        # on every commit such a fit is that of the priors below
+        pytest.param({"geometry": "dh"}, marks=pytest.mark.slow),
         {"geometry": "offsets", "axial": sides(12, 30)},
         pytest.param({"geometry": "full", "lateral": True}, marks=pytest.mark.slow),
     ],
@@ -301,12 +301,16 @@ def test_sides_of_approach_lower_the_noise() -> None:
 
 
 def test_what_poses_do_not_tell_keeps_its_prior_and_is_named(geometry: GeometryModel) -> None:
-    """The first joint's height is the tracker's: catches a parameter that runs away."""
+    """The first joint's height is the tracker's, and its axis vertical: catches a parameter that
+    runs away, and a K of chance in joints.yaml."""
     problem, _ = made_up(geometry, 0, count=30, noise_m=5e-4, geometry="dh")
     result = describe_geometry(fit_geometry(problem), None)
     assert "pan.z length" in result.prior_parameters
     height = next(p for p in result.parameters if (p.kind, p.name) == ("length", "pan.z"))
     assert abs(height.value) < 2e-3
+    joints = {one.joint: one for one in result.joints}
+    assert np.isinf(joints["pan"].stiffness_nm_per_rad)
+    assert np.isfinite(joints["lift"].stiffness_nm_per_rad)
 
 
 @pytest.mark.slow
@@ -374,10 +378,12 @@ def log_of(folder: Path, problem: GeometryProblem) -> Path:
     return write_poses(folder / "poses.csv", columns)
 
 
+@pytest.mark.slow
 def test_the_command_identifies_and_its_files_hold(
     geometry: GeometryModel, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """From a log of two markers to a model that is better at unused poses."""
+    """From a log of two markers to a model that is better at unused poses; on every commit the
+    test of meshes."""
     problem, _ = made_up(geometry, 7, count=36, noise_m=3e-4, geometry="dh")
     model = tmp_path / "arm.xml"
     model.write_text(ARM)
@@ -443,8 +449,11 @@ def test_the_tracker_is_aligned_before_the_fit(geometry: GeometryModel) -> None:
     np.testing.assert_allclose(shown, measured, atol=1e-9)
 
 
-def test_the_written_model_finds_its_meshes(geometry: GeometryModel, tmp_path: Path) -> None:
-    """Catches a folder of meshes beside the user's model, which the results do not have."""
+def test_the_written_model_finds_its_meshes(
+    geometry: GeometryModel, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Catches a folder of meshes beside the user's model, which the results do not have; and a
+    command that does not write what it has found."""
     (tmp_path / "shapes").mkdir()
     corners = "v 0 0 0\nv 0.1 0 0\nv 0 0.1 0\nv 0 0 0.1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
     (tmp_path / "shapes" / "wedge.obj").write_text(corners)
@@ -459,7 +468,13 @@ def test_the_written_model_finds_its_meshes(geometry: GeometryModel, tmp_path: P
     log = log_of(tmp_path, problem)
     asked = ["identify", "--robot", str(tmp_path / "arm.xml"), "--log", str(log), "--holdout", "0"]
     main([*asked, "--output", str(tmp_path / "out")])
-    assert compiled_model(str(tmp_path / "out" / "model.xml")).nmesh == 1
+    written = compiled_model(str(tmp_path / "out" / "model.xml"))
+    assert (written.nmesh, written.njnt) == (1, len(JOINTS))
+    assert "keep their prior" in capsys.readouterr().out
+    config = parse_yaml((tmp_path / "out" / "config.yaml").read_text())
+    assert (config["robot"], config["log"]) == (str(tmp_path / "arm.xml"), [str(log)])
+    files = {path.name for path in (tmp_path / "out").iterdir()}
+    assert {"identification.json", "joints.yaml"} <= files
 
 
 def test_joints_that_are_not_in_the_log_stand_where_the_keyframe_has_them() -> None:
@@ -520,11 +535,3 @@ def test_millimetres_are_named(geometry: GeometryModel) -> None:
     problem, _ = made_up(geometry, 7, count=20, noise_m=3e-4)
     with pytest.raises(ConfigurationError, match="convert millimetres to metres"):
         replace(problem, measured=1e3 * problem.measured).align()
-
-
-def test_a_joint_that_gravity_does_not_load_is_rigid(geometry: GeometryModel) -> None:
-    """The first axis is vertical: catches a K of chance in joints.yaml."""
-    problem, _ = made_up(geometry, 1, count=40, noise_m=5e-4, geometry="dh")
-    joints = {one.joint: one for one in describe_geometry(fit_geometry(problem), None).joints}
-    assert np.isinf(joints["pan"].stiffness_nm_per_rad)
-    assert np.isfinite(joints["lift"].stiffness_nm_per_rad)

@@ -25,6 +25,10 @@ SIMULATIONS = {
     "elastic_env/WalkInPlace-v0": {"step_period": [0.3, 0.4, 0.3], "num_steps": 1},
 }
 IDS = sorted(SIMULATIONS)
+ROBOT_AT_NIGHT = pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=[pytest.mark.slow] * ("Robot" in n)) for n in IDS]
+)
+"""One class makes it and the testbed."""
 
 
 def make(name: str, **arguments: Any) -> Any:
@@ -68,25 +72,13 @@ def test_gymnasiums_checker_finds_nothing(name: str) -> None:
         check_env(make(name).unwrapped, skip_render_check=True)  # which opens windows
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(n, marks=[pytest.mark.slow] * ("Testbed" not in n)) for n in IDS]
-)
-def test_drawing_warns_of_nothing(name: str) -> None:
-    """Catches a warning of Gymnasium, MuJoCo or the renderer where an environment is drawn."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        drawn = make(name, render_mode="rgb_array")
-        drawn.reset(seed=0)
-        drawn.render()
-
-
 @pytest.mark.parametrize("name", IDS)
 def test_stable_baselines3s_checker_finds_nothing(name: str) -> None:
     """Catches what Stable-Baselines3 cannot train on, although Gymnasium takes it."""
     check_sb3_env(make(name).unwrapped, skip_render_check=True)
 
 
-@pytest.mark.parametrize("name", IDS)
+@ROBOT_AT_NIGHT
 def test_rollouts_of_one_seed_are_equal(name: str) -> None:
     """Catches an environment that remembers the one before, in values and in types; as Gymnasium
     tests its own."""
@@ -132,7 +124,7 @@ def test_processes_of_stable_baselines3_play_as_this_one(name: str, start_method
         worlds.close()
 
 
-@pytest.mark.parametrize("name", IDS)
+@ROBOT_AT_NIGHT
 def test_the_specification_tells_the_length_of_an_episode(name: str) -> None:
     """Catches wrappers and libraries that ask for it and find None; a shorter one that is asked
     for stays."""
@@ -147,7 +139,7 @@ def test_the_specification_tells_the_length_of_an_episode(name: str) -> None:
     assert again.unwrapped.task.num_steps == env.unwrapped.task.num_steps
 
 
-@pytest.mark.parametrize("name", IDS)
+@ROBOT_AT_NIGHT
 def test_a_step_before_the_reset_is_refused(name: str) -> None:
     """Catches a robot that moves before its equilibrium, also as one world of several, and under
     a residual."""
@@ -169,8 +161,10 @@ def test_a_step_before_the_reset_is_refused(name: str) -> None:
     "name",  # all are drawn by one class
     [pytest.param(n, marks=[pytest.mark.slow] * ("Testbed" not in n)) for n in IDS],
 )
+@pytest.mark.filterwarnings("error")
 def test_a_vector_environment_draws_its_worlds(name: str) -> None:
-    """Catches frames that all show the first world."""
+    """Catches frames that all show the first world, and a warning of Gymnasium, MuJoCo or the
+    renderer where an environment is drawn."""
     env = make_vec(name, 2, render_mode="rgb_array", scenario="nominal")
     env.reset(seed=0)
     action = np.zeros(env.action_space.shape, dtype=np.float32)

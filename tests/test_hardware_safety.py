@@ -206,7 +206,6 @@ def supervised(running: RunningEmulator, buses: list[SupervisedBus]) -> Iterator
     if not buses:
         buses.append(SupervisedBus({running.port: [1, 2]}))
     yield buses[0]
-    without_faults(running)
     try:
         buses[0].disable()
     except HardwareError:  # a test has ended its supervisor

@@ -311,6 +311,18 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.fixture(scope="module")
+def untrained(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Offsets of zero, saved as `elastic iterate` saves what it learned."""
+    folder = tmp_path_factory.mktemp("untrained")
+    options = Iterate(env="testbed", scenario="soft", reference=SINE, seed=3, output=folder)
+    env = make_testbed(1)
+    policy = baselines.make("iterative", env, learning=SHORT)
+    policy.play(np.zeros((1, env.unwrapped.task.num_steps + 1, 1)))
+    options._save(env, policy, folder)
+    return folder
+
+
 @pytest.mark.slow
 def test_what_was_learned_is_saved_and_played(run: Path) -> None:
     """Catches a table that plays shifted, scaled or around another base than it was learned
@@ -339,40 +351,40 @@ def test_what_was_learned_is_saved_and_played(run: Path) -> None:
     assert track("iterative", is_walker=False) is track(f"iterative:{run}") is Track.WALKS
 
 
-def test_another_motion_or_robot_is_refused(run: Path) -> None:
+def test_another_motion_or_robot_is_refused(untrained: Path) -> None:
     """Catches offsets that are played in a motion that they are wrong for."""
     for change in ({"amplitude": 0.1}, {"duration_s": 0.3}):
         env = make_testbed(reference={**SINE, **change})
         with pytest.raises(ConfigurationError, match=r"amplitude|number of rows"):
-            baselines.make(f"iterative:{run}", env)
+            baselines.make(f"iterative:{untrained}", env)
     with pytest.raises(ConfigurationError, match="robot 'testbed'"):
-        baselines.make(f"iterative:{run}", make_walker(1))
+        baselines.make(f"iterative:{untrained}", make_walker(1))
 
 
-def damaged(run: Path, folder: Path, change: Any, offsets: bytes | None = None) -> Path:
+def damaged(learned: Path, folder: Path, change: Any, offsets: bytes | None = None) -> Path:
     """A copy of a run's policy with its description changed, or its offsets."""
-    content = json.loads((run / DESCRIPTION).read_text())
+    content = json.loads((learned / DESCRIPTION).read_text())
     change(content)
     (folder / DESCRIPTION).write_text(json.dumps(content))
-    (folder / OFFSETS).write_bytes((run / OFFSETS).read_bytes() if offsets is None else offsets)
+    (folder / OFFSETS).write_bytes((learned / OFFSETS).read_bytes() if offsets is None else offsets)
     return folder
 
 
-def test_damaged_files_say_what_is_wrong(run: Path, tmp_path: Path) -> None:
+def test_damaged_files_say_what_is_wrong(untrained: Path, tmp_path: Path) -> None:
     """Catches a table that is played although it is cut short, not finite, or of another shape."""
     env = make_testbed()
     rows = env.unwrapped.task.num_steps + 1
 
     def problem(change: Any = lambda content: None, offsets: bytes | None = None) -> str:
         with pytest.raises(ConfigurationError) as caught:
-            baselines.make(f"iterative:{damaged(run, tmp_path, change, offsets)}", env)
+            baselines.make(f"iterative:{damaged(untrained, tmp_path, change, offsets)}", env)
         return str(caught.value)
 
     assert "shape (T, 1)" in problem(offsets=save({"offsets": np.zeros((rows, 2))}))
     assert "finite" in problem(offsets=save({"offsets": np.full((rows, 1), np.nan)}))
     assert "number of rows" in problem(offsets=save({"offsets": np.zeros((rows - 1, 1))}))
     assert "one tensor, 'offsets'" in problem(offsets=save({"other": np.zeros((rows, 1))}))
-    assert "cannot be read" in problem(offsets=(run / OFFSETS).read_bytes()[:-8])
+    assert "cannot be read" in problem(offsets=(untrained / OFFSETS).read_bytes()[:-8])
     assert "must be a baseline" in problem(lambda content: content.update(base="residual:x"))
     assert "describes no table" in problem(lambda content: content.update(colour="red"))
     with pytest.raises(ConfigurationError, match="no learned offsets at"):

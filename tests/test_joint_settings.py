@@ -246,7 +246,8 @@ KV0 = DRIVEN.replace(
 )
 
 
-def test_what_damps_a_servo_is_no_friction() -> None:
+@pytest.mark.parametrize("scenario", ["ideal", pytest.param("nominal", marks=pytest.mark.slow)])
+def test_what_damps_a_servo_is_no_friction(scenario: str) -> None:
     """Catches a rotor that swings for minutes in `ideal`, as its only damping is left out with
     the friction."""
     joints = {"j*": 400}
@@ -255,8 +256,7 @@ def test_what_damps_a_servo_is_no_friction() -> None:
     assert [one.viscous_friction for one in config.joints.values()] == [0.0, 0.0]
     without = sag(joints, model=KV0)
     assert without > 5e-3
-    assert sag(joints, "input", model=KV0) < 1e-5
-    assert sag(joints, "input", "nominal", model=KV0) < 1e-5
+    assert sag(joints, "input", scenario, model=KV0) < 1e-5
 
 
 @pytest.mark.parametrize(
@@ -366,7 +366,8 @@ def test_an_assumed_rotor_is_no_heavier_than_its_links() -> None:
 
 
 @pytest.mark.parametrize(
-    "stiffness", [pytest.param(400, marks=pytest.mark.slow), {"j1": 4000, "j2": 300}, 60]
+    "stiffness",
+    [*(pytest.param(K, marks=pytest.mark.slow) for K in (400, 60)), {"j1": 4000, "j2": 300}],
 )
 def test_assumed_joints_come_to_rest_in_the_time_that_poses_settle(stiffness: Any) -> None:
     """Catches damping that fits the lightest link only, and an integrator that lets go for

@@ -410,7 +410,8 @@ def write_board(policies: Sequence[Any]) -> None:
 
 
 def play_quickly(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Play in this process, without figures; the titles of the policies that are played."""
+    """Play in this process, without figures and report; the titles of the policies that are
+    played."""
     played: list[str] = []
 
     def run(conditions: Sequence[Condition], console: Console, *_: object) -> list[Evaluation]:
@@ -421,7 +422,8 @@ def play_quickly(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     monkeypatch.setattr(
         train.commands.comparison, "step_times", lambda cells: step_times(cells, steps=2, rounds=1)
     )
-    monkeypatch.setattr(train.commands.comparison, "draw_figures", lambda *_: [])
+    for name in ("draw_figures", "write_report"):
+        monkeypatch.setattr(train.commands.comparison, name, lambda *_: [])
     return played
 
 

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from baselines.catalogue import Track
 from docs.pages.learned import learned_maps
@@ -323,9 +324,17 @@ def test_panels_say_who_is_best_and_by_how_much_learning_is_ahead() -> None:
     assert (Square("", "", "#1a7f5a").ink, Square("", "", "#ffffff").ink) == ("#ffffff", "#1f2328")
 
 
-def test_report_pictures_and_table_of_a_map_agree() -> None:
-    """Catches a map that is upside down on the page, a picture that is missing, and a table with
-    other figures."""
+@pytest.mark.slow
+def test_a_map_is_drawn() -> None:
+    """Catches a picture that is missing, or without squares."""
+    (picture,) = draw_maps([four()], Path())
+    assert picture.name == "map_step_period_3_s_nominal_pelvis_error_rms_rad.png"
+    with Image.open(picture) as image:
+        assert len(np.unique(np.asarray(image.convert("L")))) > 20
+
+
+def test_report_and_table_of_a_map_agree() -> None:
+    """Catches a map that is upside down on the page, and a table with other figures."""
     found = four()
     evaluations = [
         e
@@ -339,10 +348,8 @@ def test_report_pictures_and_table_of_a_map_agree() -> None:
         )
     ]
     with run_folder("x", {}, 0) as folder:
-        (picture,) = draw_maps([found], folder)
         write_report(Results("x", evaluations, changes(evaluations), folder, maps=[found]))
         table = write_maps([found], folder / "map.csv")
-    assert picture.name == "map_step_period_3_s_nominal_pelvis_error_rms_rad.png"
     page = (folder / "report.html").read_text()
     text = (folder / "report.md").read_text()
     headings = re.findall(r"<h2 id=\"s\d+\">([^<]*)</h2>", page)

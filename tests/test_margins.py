@@ -180,7 +180,7 @@ def test_causes_are_those_of_every_world_alone() -> None:
     """Catches a robot that cannot stand and ends the others, and a world that is taken for
     another."""
     values = [("push_n", 0.0), ("stiffness", 0.2), ("push_n", 900.0)]
-    conditions = [walk(swept={f"scenario.{name}": value}) for name, value in values]
+    conditions = [walk("zero", swept={f"scenario.{name}": value}) for name, value in values]
     together = failure_causes(conditions, 1)
     assert together.tolist() == ["", NO_REST, "fell"]
     assert failure_causes(conditions[2:3], 1).tolist() == ["fell"]

@@ -101,15 +101,15 @@ def test_a_users_text_stays_short_in_an_error(entry: Callable[[str], Any]) -> No
     "arguments",
     [
         ["compare", "@"],
-        ["train", "@"],
+        pytest.param(["train", "@"], marks=pytest.mark.slow),
         ["train", "--resume", "@"],
-        ["bench", "@"],
+        pytest.param(["bench", "@"], marks=pytest.mark.slow),
         ["robot", "@"],
-        ["@"],
+        pytest.param(["@"], marks=pytest.mark.slow),
         ["evaluate", "--scenario", "@"],
         ["play", "--video", "@"],
-        ["evaluate", "--jobs", "@"],
-        ["evaluate", "--output", "@"],
+        pytest.param(["evaluate", "--jobs", "@"], marks=pytest.mark.slow),
+        pytest.param(["evaluate", "--output", "@"], marks=pytest.mark.slow),
     ],
 )
 def test_the_command_line_stays_short(

@@ -5,6 +5,7 @@ import io
 import re
 import subprocess
 import tomllib
+from ast import literal_eval
 from functools import reduce
 from importlib import import_module
 from pathlib import Path
@@ -33,12 +34,17 @@ def test_the_readme_is_one_screen_and_shows_python_early() -> None:
     )
 
 
-def test_the_python_of_the_readme_prints_what_it_says() -> None:
+@pytest.mark.parametrize("policies", [1, pytest.param(3, marks=pytest.mark.slow)])
+def test_the_python_of_the_readme_prints_what_it_says(policies: int) -> None:
     """Catches a snippet that no longer runs, and figures beside it that are old."""
     code, printed = (
         re.findall(rf"```{kind}\n(.*?)```", README, flags=re.DOTALL)[0]
         for kind in ("python", "text")
     )
+    named = re.findall(r"for name in (.*):", code)[0]
+    code = code.replace(named, str(literal_eval(named)[:policies]))
+    printed = "".join(printed.splitlines(keepends=True)[:policies])
+    assert printed.count("\n") == policies
     output = io.StringIO()
     with contextlib.redirect_stdout(output):
         exec(code, {})

@@ -83,7 +83,7 @@ def test_a_copy_in_the_midst_of_an_episode_goes_on_bit_for_bit(
 
 def test_a_vector_environment_that_was_forked_steps_as_its_parent() -> None:
     """Catches a step that waits for ever for threads that a fork does not copy."""
-    env = made("walker", 3, "spread")
+    env = made("walker", 2, "spread")
     env.reset(seed=3)
     for _ in range(20):
         env.step(np.zeros(env.action_space.shape, dtype=np.float32))

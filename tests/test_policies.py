@@ -33,8 +33,6 @@ VARIANTS: dict[str, tuple[str, dict[str, Any]]] = {
     **{name: (name, {}) for name in NAMES},
     "newton": ("input", {"output": "newton", "gravity": "tree", "ramp_s": 0.1}),
 }
-AT_NIGHT = pytest.param("uncompensated", marks=pytest.mark.slow)
-"""Without memory, as `zero` is."""
 PERIOD_S = 0.004
 AT_ONCE = {"ramp_s": PERIOD_S}
 """Options with which the compensation is there from the first step."""
@@ -93,7 +91,11 @@ def scalar_actions(
 
 
 @pytest.mark.parametrize(
-    "variant", [AT_NIGHT, *(name for name in VARIANTS if name != "uncompensated")]
+    "variant",
+    [
+        pytest.param(name, marks=[pytest.mark.slow] * (name not in (*WITH_MEMORY, "newton")))
+        for name in VARIANTS  # the others have no memory
+    ],
 )
 def test_vector_actions_are_the_scalar_ones_row_by_row(variant: str) -> None:
     """Catches memory that leaks between worlds or episodes, and formulas that depend on the size
@@ -660,7 +662,7 @@ def test_link_estimate_at_rest_is_the_link_angle(
     np.testing.assert_allclose(estimate, q, rtol=0.0, atol=tolerance)
 
 
-@pytest.mark.parametrize("name", ["input", "dynamic"])
+@pytest.mark.parametrize("name", [pytest.param("input", marks=pytest.mark.slow), "dynamic"])
 def test_link_estimate_in_motion_is_what_the_policy_saw(name: str) -> None:
     """Catches an estimate of the next control period beside the encoders of this one."""
     env = vector(2, scenario="ideal")

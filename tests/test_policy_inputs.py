@@ -34,6 +34,13 @@ from tests.test_residual import QUICK, SINE, TESTBED, WALKER, random_network, ve
 ROOT = Path(__file__).parents[1]
 WORST = {"walker/adaptive_posture", "walker/talos", "walker/thormang", "walker/oracle"}
 """They act on more once the robot walks, from control step 250 on."""
+BASES = [*(f"walker/{name}" for name in ON_THE_WALKER), *(f"testbed/{n}" for n in ON_JOINTS)]
+WITHIN_OTHERS = {
+    *("walker/zero", "walker/uncompensated_open", "walker/input", "walker/posture"),
+    *("walker/adaptive", "walker/hip_sensor"),
+}
+"""What they do with inputs, others do too: `input_open`, `input_output`, `adaptive_posture`,
+`torque_sensor`."""
 ALL = dict.fromkeys(INPUTS)
 
 
@@ -57,7 +64,10 @@ def model_of(env: Any) -> WalkerModel:
 
 
 @pytest.mark.parametrize(
-    "name", [*(f"walker/{name}" for name in ON_THE_WALKER), *(f"testbed/{n}" for n in ON_JOINTS)]
+    "name",
+    [
+        *(pytest.param(n, marks=[pytest.mark.slow] * (n in WITHIN_OTHERS)) for n in BASES),
+    ],
 )
 def test_zero_is_the_base_to_the_last_bit_for_every_base_and_input(name: str) -> None:
     """Catches an input that rounds where nothing acts, and one that a wrapper loses or takes
@@ -72,7 +82,7 @@ def test_zero_is_the_base_to_the_last_bit_for_every_base_and_input(name: str) ->
     nothing = np.zeros((1, corrected.num_residuals))
     observation, _ = env.reset(seed=3)
     state = kept = None
-    for _ in range(300 if name in WORST else 30):
+    for _ in range(275 if name in WORST else 30):
         action, state = plain.predict(observation, state)
         same, kept = corrected.act(observation, nothing, kept)
         np.testing.assert_array_equal(same.reshape(np.shape(action)), action)

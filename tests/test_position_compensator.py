@@ -101,7 +101,7 @@ def needed(
     return data.qfrc_inverse[at.q_dot].copy()
 
 
-@settings(max_examples=25)
+@settings(max_examples=10)
 @given(seed=st.integers(0, 10_000))
 def test_the_torque_is_that_of_mujoco(seed: int) -> None:
     """Catches an ignored spring or gravcomp, a held joint at the wrong place, and joints in the
@@ -115,7 +115,7 @@ def test_the_torque_is_that_of_mujoco(seed: int) -> None:
     )
 
 
-@settings(max_examples=25)
+@settings(max_examples=10)
 @given(seed=st.integers(0, 10_000), elbow=st.floats(-2.0, 2.0))
 def test_a_hinge_that_is_not_commanded_stays_where_the_keyframe_has_it(
     seed: int, elbow: float
@@ -132,7 +132,7 @@ def test_a_hinge_that_is_not_commanded_stays_where_the_keyframe_has_it(
     np.testing.assert_allclose(compensator.torque(q, q_dot, q_ddot), expected, rtol=0, atol=1e-9)
 
 
-@settings(max_examples=25)
+@settings(max_examples=10)
 @given(seed=st.integers(0, 10_000), mass=st.floats(0.0, 5.0))
 def test_a_payload_is_a_mass_at_its_place(seed: int, mass: float) -> None:
     """Catches a place in the frame of the wrong body, and a payload that is added to the last

@@ -364,10 +364,10 @@ def test_all_kinds_are_in_the_union() -> None:
 
 def test_motions_of_many_worlds_that_fill_the_memory_are_refused() -> None:
     """Catches gigabytes of plans, one for each world, where one sentence is due."""
-    motion = Motion(partial(Multisine(duration_s=3600.0).plan_about, np.zeros(6)), is_random=True)
+    motion = Motion(partial(Multisine(duration_s=900.0).plan_about, np.zeros(6)), is_random=True)
     assert len(PlanTable(motion, 0.05, 2).motion) == 2
-    with pytest.raises(ConfigurationError, match=r"128 motions of .* MB, at most 500 MB; take a"):
-        PlanTable(motion, 0.05, 128)
+    with pytest.raises(ConfigurationError, match=r"512 motions of .* MB, at most 500 MB; take a"):
+        PlanTable(motion, 0.05, 512)
 
 
 def test_long_references_of_poses_need_memory_for_their_steps_alone() -> None:

@@ -191,7 +191,11 @@ def played_in_c(
 
 
 @pytest.mark.parametrize("compiler", COMPILERS)
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize(
+    "case",
+    # the example of the last one checks itself on every commit
+    ["testbed", "mirrored", pytest.param("clipped", marks=pytest.mark.slow)],
+)
 def test_the_header_computes_what_python_does(case: str, compiler: str, tmp_path: Path) -> None:
     """Catches what is wrong with a table, a layer, an activation or the mirror."""
     layout = ResidualLayout.load(residual(case, tmp_path / "r"))
@@ -313,6 +317,7 @@ def test_a_residual_that_no_robot_can_play_is_no_graph(tmp_path: Path) -> None:
     assert "antigravity" not in sys.modules
 
 
+@pytest.mark.slow
 def test_the_layout_needs_no_torch() -> None:
     modules = "train.export.residual_layout, train.export.c_arm"
     code = f"import sys, {modules}; print('torch' in sys.modules)"

@@ -318,6 +318,7 @@ def test_a_payload_hangs_at_the_end_effector() -> None:
     assert plant.true.rigid.body_mass.sum() == pytest.approx(13.1)
 
 
+@pytest.mark.slow
 def test_compensators_take_the_motion_of_the_end_effector_back() -> None:
     """Catches a compensator that knows another friction, servo or load than the robot has."""
     without, compensated = (metrics_of(scalar(), policy) for policy in ("uncompensated", "dynamic"))

@@ -113,6 +113,7 @@ with lock_run(Path(sys.argv[1])):
 """
 
 
+@pytest.mark.slow
 def test_a_run_is_worked_on_by_one_program_and_a_kill_frees_it(tmp_path: Path) -> None:
     """Catches two --resume of one run at once, a lock that outlives its program, and one that
     nobody waits for."""

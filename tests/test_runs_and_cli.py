@@ -45,6 +45,7 @@ from train.commands.play import play
 from train.evaluate.conditions import Condition, PolicySpec
 from train.evaluate.episodes import Evaluation, evaluate
 from train.evaluate.rollout import PolicyFailedError
+from train.figures.comparison_figures import figure_name
 from train.runs.console import warn_once
 from train.runs.folders import create_folder, run_folder
 from train.runs.progress import show_progress
@@ -123,26 +124,21 @@ def refused(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
 # The result of an evaluation.
 
 
-def test_records_depend_neither_on_threads_nor_on_the_other_episodes() -> None:
-    """Catches seeds that count differently in a batch, and worlds that disturb each other."""
+def test_records_depend_neither_on_threads_nor_on_the_other_episodes(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Catches seeds that count differently in a batch, worlds that disturb each other, and episodes
+    lost or repeated where there are more of them than worlds."""
     multi = {"reference": MULTISINE, "seed": 5, "scenario": "sensor"}
-    together = evaluate(condition(**multi, episodes=2), num_threads=2)
-    single_thread = evaluate(condition(**multi, episodes=2), num_threads=1)
+    together = evaluate(condition(**multi, episodes=3), num_threads=2)
     alone = evaluate(condition(**{**multi, "seed": 6}), num_threads=1).episodes[0]
-    assert together.episodes == single_thread.episodes
     assert together.episodes[1] == alone
-    assert [episode["seed"] for episode in together.episodes] == [5, 6]
-    assert len({episode["link_error_rms_rad"] for episode in together.episodes}) == 2
-
-
-def test_records_do_not_depend_on_how_episodes_are_batched(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches episodes lost or repeated where there are more of them than worlds."""
-    cell = condition(reference=MULTISINE, episodes=3)
-    whole = evaluate(cell, num_threads=1)
+    assert [episode["seed"] for episode in together.episodes] == [5, 6, 7]
+    assert len({episode["link_error_rms_rad"] for episode in together.episodes}) == 3
     monkeypatch.setattr(train.evaluate.episodes, "MOST_WORLDS", 2)
-    parts = evaluate(cell, num_threads=1)
-    assert parts.episodes == whole.episodes
-    np.testing.assert_array_equal(parts.trace["link_angle"], whole.trace["link_angle"])
+    parts = evaluate(condition(**multi, episodes=3), num_threads=1)
+    assert parts.episodes == together.episodes
+    np.testing.assert_array_equal(parts.trace["link_angle"], together.trace["link_angle"])
 
 
 def test_record_names_its_cell_and_agrees_with_its_trace() -> None:
@@ -302,11 +298,13 @@ def test_output_that_exists_is_refused(kind: str, tmp_path: Path) -> None:
 
 @dataclass(frozen=True)
 class Compared:
-    """Folder of `elastic compare`, its configuration, and what it printed."""
+    """Folder of `elastic compare`, its configuration, what it printed, and what it played in this
+    process."""
 
     folder: Path
     config: CompareConfig
     printed: str
+    evaluations: list[Evaluation]
 
 
 @pytest.fixture(scope="module")
@@ -330,6 +328,12 @@ def compare_in(root: Path, is_here: bool) -> Compared:
         "env_options": {"stiffness": 900},
     }
     (root / "small.yaml").write_text(yaml.safe_dump(content))
+    evaluations: list[Evaluation] = []
+
+    def noted(conditions: Sequence[Condition], console: Console, *_: object) -> list[Evaluation]:
+        evaluations.extend(run_here(conditions, console))
+        return evaluations
+
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(root)
         console = Console(
@@ -337,13 +341,14 @@ def compare_in(root: Path, is_here: bool) -> Compared:
         )
         patch.setattr("train.commands.cli.CONSOLE", console)
         if is_here:
-            patch.setattr(train.commands.comparison, "run_conditions", run_here)
+            patch.setattr(train.commands.comparison, "run_conditions", noted)
         main(["compare", "small.yaml", "--jobs", "1"])
         console.file.close()
     return Compared(
         root / "runs" / "small",
         load_yaml(root / "small.yaml", CompareConfig),
         (root / "printed.txt").read_text(),
+        evaluations,
     )
 
 
@@ -358,11 +363,9 @@ def test_compare_writes_one_row_per_episode_with_every_metric(compared: Compared
     ]
     assert {metric.name for metric in METRICS} <= rows[0].keys()
     assert {"termination", "diverged", "link_estimate_error_rms_rad"} <= rows[0].keys()
-    expected = [
-        episode
-        for cell in compared.config.conditions()
-        for episode in evaluate(cell, num_threads=1).episodes
-    ]
+    cells = [evaluation.condition for evaluation in compared.evaluations]
+    assert cells == compared.config.conditions()
+    expected = [episode for own in compared.evaluations for episode in own.episodes]
     assert rows == [{key: str(value) for key, value in episode.items()} for episode in expected]
 
 
@@ -443,7 +446,11 @@ def test_failed_episodes_are_counted_and_not_averaged_in() -> None:
 def test_evaluate_again_makes_a_second_folder_and_leaves_the_first(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """Catches results that are overwritten: `elastic evaluate` twice, one after the other."""
+    """Catches results that are overwritten: `elastic evaluate` where a run of it lies."""
+    Path("runs/evaluate").mkdir(parents=True)
+    for name in ("episodes.csv", "config.yaml", "sine.svg"):
+        Path("runs/evaluate", name).write_text("years of work")
+    first = files_of(Path("runs/evaluate"))
     arguments = [
         "evaluate",
         "--policy",
@@ -458,12 +465,9 @@ def test_evaluate_again_makes_a_second_folder_and_leaves_the_first(
         "svg",
     ]
     main(arguments)
-    first = files_of(Path("runs/evaluate"))
-    main(arguments)
     assert files_of(Path("runs/evaluate")) == first
     assert {path.name for path in Path("runs").iterdir()} == {"evaluate", "evaluate-2"}
-    assert Path("runs/evaluate-2/episodes.csv").read_bytes() == first["episodes.csv"]
-    assert [row["seed"] for row in rows_of(Path("runs/evaluate/episodes.csv"))] == ["6", "7"]
+    assert [row["seed"] for row in rows_of(Path("runs/evaluate-2/episodes.csv"))] == ["6", "7"]
     assert "runs/evaluate-2/episodes.csv" in capsys.readouterr().out
 
 
@@ -488,16 +492,26 @@ def test_evaluate_hands_the_stiffness_to_the_policy() -> None:
     assert rms[3] < 0.05 * rms[4]
 
 
-@pytest.mark.usefixtures("in_process")
-def test_two_references_of_one_kind_stay_apart() -> None:
+TWO_SINES: dict[str, Any] = {
+    "name": "two",
+    "references": [SINE, {**SINE, "frequency_hz": 0.5}],
+    "policies": ["zero"],
+}
+
+
+def test_two_references_of_one_kind_have_names_of_their_own() -> None:
     """Catches the second sine's figure written over the first's, and rows of which nobody can
     say whose they are."""
-    content = {
-        "name": "two",
-        "references": [SINE, {**SINE, "frequency_hz": 0.5}],
-        "policies": ["zero"],
-    }
-    Path("two.yaml").write_text(yaml.safe_dump(content))
+    cells = CompareConfig(**TWO_SINES).conditions()
+    assert len({cell.reference_name for cell in cells}) == 2
+    assert len({figure_name("time", Evaluation(cell)) for cell in cells}) == 2
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("in_process")
+def test_two_references_of_one_kind_stay_apart() -> None:
+    """Catches files and rows that do not take the names of their references."""
+    Path("two.yaml").write_text(yaml.safe_dump(TWO_SINES))
     main(["compare", "two.yaml", "--figure-format", "svg"])
     assert len(list(Path("runs/two").glob("time_*.svg"))) == 2
     assert len({row["reference"] for row in rows_of(Path("runs/two/episodes.csv"))}) == 2
@@ -999,6 +1013,7 @@ def test_play_films_the_episode_and_keeps_an_existing_film(
     assert Path("x.gif").read_bytes() == before
 
 
+@pytest.mark.slow
 def test_play_writes_mp4_also_of_a_time_shorter_than_a_control_step() -> None:
     """Catches a writer that takes one format alone, and a film that is announced and not there."""
     play(condition(), Console(quiet=True), Path("deep/x.mp4"), max_s=0.001)

@@ -81,7 +81,7 @@ def test_at_constant_speed_the_command_leads_by_friction_over_k(rate: float) -> 
 def test_friction_fed_forward_leaves_less_error() -> None:
     """Catches a friction of the wrong sign at the robot, which would double the error."""
     arguments = {
-        "reference": {"kind": "sine", "duration_s": 2.0},
+        "reference": {"kind": "sine", "duration_s": 1.0},
         "scenario": "nominal",
         "sensors": [],
     }
@@ -169,7 +169,7 @@ def test_the_link_returns_from_a_torque_that_holds_it_back() -> None:
     errors, states, _ = played(
         baselines.make("disturbance_observer", env, observer=ObserverGains(friction=False)), env
     )
-    uncompensated, _, _ = played(baselines.make("dynamic", env), env)
+    uncompensated, _, _ = played(baselines.make("dynamic", env), env, steps=400)
     assert uncompensated[-1, 0] == pytest.approx(6.0 / 1061.0, rel=0.02)
     assert abs(errors[-1, 0]) < 0.02 * uncompensated[-1, 0]
     assert states[-1].joints.disturbance[0, 0] == pytest.approx(6.0, rel=0.02)

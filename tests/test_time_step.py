@@ -49,7 +49,10 @@ def test_a_model_that_no_step_follows_is_refused_without_messages_of_mujoco(
     assert (tmp_path / "MUJOCO_LOG.TXT").is_file()
 
 
-@pytest.mark.parametrize(("stiffness", "is_refused"), [(4e4, False), (6e4, True), (1e5, True)])
+@pytest.mark.parametrize(
+    ("stiffness", "is_refused"),
+    [(4e4, False), (6e4, True), pytest.param(1e5, True, marks=pytest.mark.slow)],
+)
 def test_a_walker_that_would_explode_is_refused_with_the_largest_step(
     stiffness: float, is_refused: bool
 ) -> None:
@@ -88,6 +91,7 @@ JOINT = ElasticJoint(stiffness=1000.0, damping=10.0, rotor_inertia=0.1)
 
 
 IMPLICITFAST = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+AT_NIGHT = ("ant", "half_cheetah", "humanoid", "inverted_double_pendulum", "pusher", "walker2d")
 ASSETS = sorted((Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets").glob("*.xml"))
 
 
@@ -159,7 +163,10 @@ def test_what_no_integrator_follows_is_refused_with_the_largest_step(integrator:
         make_elastic(arm(integrator, largest_s), {"shoulder": JOINT})
 
 
-@pytest.mark.parametrize("path", ASSETS, ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    "path",
+    [pytest.param(p, id=p.stem, marks=[pytest.mark.slow] * (p.stem in AT_NIGHT)) for p in ASSETS],
+)
 @pytest.mark.filterwarnings(
     "ignore:the elastic joints explode", "ignore:compiler attribute 'settotalmass'"
 )

@@ -25,6 +25,7 @@ print(env.step(env.action_space.sample() * 0.0)[1] <= 0.0)
 """
 
 
+@pytest.mark.slow
 def test_the_users_own_train_py_gets_the_wrappers(tmp_path: Path) -> None:
     """Catches a file of the user that imports itself in the place of our package, which is
     called train too."""

@@ -76,9 +76,18 @@ def turn(
     return data, world
 
 
-@pytest.mark.parametrize("speed", [0.07, -0.07])
-@pytest.mark.parametrize("load", [0.6, -0.2, 0.02])
-@pytest.mark.parametrize("form", ["tendon", "rigid"])
+@pytest.mark.parametrize(
+    ("form", "load", "speed"),
+    [
+        *(("tendon", load, speed) for load in (0.6, -0.2, 0.02) for speed in (0.07, -0.07)),
+        ("rigid", 0.6, 0.07),
+        ("rigid", -0.2, -0.07),
+        *(
+            pytest.param("rigid", *turned, marks=pytest.mark.slow)
+            for turned in ((0.6, -0.07), (-0.2, 0.07), (0.02, 0.07), (0.02, -0.07))
+        ),
+    ],
+)
 def test_a_load_that_slides_up_or_down_takes_its_share(
     form: Form, load: float, speed: float
 ) -> None:
@@ -153,7 +162,7 @@ def test_friction_only_takes_energy(joint: ElasticJoint) -> None:
 
 
 @pytest.mark.parametrize("form", ["tendon", "rigid"])
-@pytest.mark.parametrize("load", [0.0, 0.12, -0.1])
+@pytest.mark.parametrize("load", [0.0, 0.12, pytest.param(-0.1, marks=pytest.mark.slow)])
 def test_a_motor_under_load_reaches_the_speed_of_the_closed_form(form: Form, load: float) -> None:
     """Catches a back-EMF that MuJoCo's driver compensates, and a gear loss k_t < k_e that is
     lost."""
@@ -221,8 +230,20 @@ def test_many_worlds_are_one_world_bit_for_bit(form: Form) -> None:
     assert not np.array_equal(many[:, 0], many[:, 1])
 
 
-@pytest.mark.parametrize("num_worlds", [1, 2])
-@pytest.mark.parametrize("copied", [copy.deepcopy, lambda one: pickle.loads(pickle.dumps(one))])
+def through_pickle(one: Any) -> Any:
+    """What a process receives of it."""
+    return pickle.loads(pickle.dumps(one))
+
+
+@pytest.mark.parametrize(
+    ("copied", "num_worlds"),
+    [
+        (copy.deepcopy, 1),
+        (through_pickle, 2),
+        pytest.param(copy.deepcopy, 2, marks=pytest.mark.slow),
+        pytest.param(through_pickle, 1, marks=pytest.mark.slow),
+    ],
+)
 def test_a_copy_goes_on_as_its_original(num_worlds: int, copied: Any) -> None:
     """Catches friction that a copy forgets, or that it shares."""
     simulation = simulate(plant(JOINT, gravity=9.81), num_worlds)

@@ -483,24 +483,23 @@ def test_a_world_of_the_vector_is_the_scalar_environment_for_a_whole_episode(
     assert info["time_s"][1] == 0.0  # begun anew
 
 
-@pytest.mark.parametrize(
-    "scenario", [f"{HARD}+slope", *(pytest.param(s, marks=pytest.mark.slow) for s in SCENARIOS)]
-)
+@pytest.mark.slow  # every commit plays worlds beside others, and 2 threads, in test_mixed_worlds
+@pytest.mark.parametrize("scenario", [f"{HARD}+slope", *SCENARIOS])
 def test_results_depend_neither_on_threads_nor_on_the_number_of_worlds(scenario: str) -> None:
     """Catches a world whose noise, robot or physics depends on its neighbours or on who computes
     it."""
-    actions = random_actions(15, 5, seed=2)
+    actions = random_actions(15, 7, seed=2)
     logs = {}
-    for num_envs, num_threads in [(5, 1), (5, 2), (1, 1)]:
+    for num_envs, num_threads in [(7, 1), (7, 2), (1, 1)]:
         env = walk_worlds(num_envs, num_threads=num_threads, scenario=scenario)
         log = [env.reset(seed=100)[0]]
         log += [env.step(action[:num_envs])[0] for action in actions]
         logs[num_envs, num_threads] = np.array(log)
-    np.testing.assert_array_equal(logs[5, 2], logs[5, 1])
-    np.testing.assert_array_equal(logs[1, 1], logs[5, 1][:, :1])
-    for world in (0, 4):
+    np.testing.assert_array_equal(logs[7, 2], logs[7, 1])
+    np.testing.assert_array_equal(logs[1, 1], logs[7, 1][:, :1])
+    for world in (0, 6):
         scalar = record(make_walk(**SHORT, scenario=scenario), 100 + world, actions[:, world])
-        np.testing.assert_array_equal(scalar.observations, logs[5, 1][:, world])
+        np.testing.assert_array_equal(scalar.observations, logs[7, 1][:, world])
 
 
 class Pair:
@@ -589,6 +588,7 @@ def test_one_seed_per_world_or_an_error() -> None:
         env.reset(seed=[1, 2])
 
 
+@pytest.mark.slow
 def test_random_actions_end_in_falls_with_a_reason_and_never_in_bad_numbers() -> None:
     """Catches NaN in what a learner sees, ends without a reason, and a world that starts anew
     without a word."""

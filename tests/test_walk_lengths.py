@@ -13,7 +13,7 @@ from elastic_env.robots.thormang.environment import make_vector as make_walk_vec
 STEP_S = 1.1
 ROWS = 275
 """Control steps of a step."""
-DRAWN: dict[str, Any] = {"step_period": STEP_S, "num_steps": 10, "fewest_steps": 4}
+DRAWN: dict[str, Any] = {"step_period": STEP_S, "num_steps": 8, "fewest_steps": 4}
 NO_OFFSET = np.zeros(12, np.float32)
 
 
@@ -26,18 +26,21 @@ def shortest_walk(env: Any) -> int:
     """A seed that draws as few steps as there can be."""
     for seed in range(100):
         env.reset(seed=seed)
-        if skipped(env)[0] == 6 * ROWS:
+        if skipped(env)[0] == 4 * ROWS:
             return seed
     raise AssertionError
 
 
-def test_a_shorter_walk_is_that_of_a_plan_of_as_many_steps() -> None:
+@pytest.mark.parametrize(
+    "policy", ["input_output", pytest.param("foothold", marks=pytest.mark.slow)]
+)
+def test_a_shorter_walk_is_that_of_a_plan_of_as_many_steps(policy: str) -> None:
     """Catches a jump to another phase or on another foot, a clock that does not follow, an end at
     another time, and scores against the rows left out."""
     env = make_walk(**DRAWN, scenario="ideal")
     plain = make_walk(step_period=STEP_S, num_steps=4, scenario="ideal")
     seed = shortest_walk(env)
-    policies = [baselines.make("foothold", one) for one in (env, plain)]
+    policies = [baselines.make(policy, one) for one in (env, plain)]
     shown = [one.reset(seed=seed)[0] for one in (env, plain)]
     states: list[Any] = [None, None]
     names = env.unwrapped.task.observation_table.names
@@ -60,7 +63,7 @@ def test_a_shorter_walk_is_that_of_a_plan_of_as_many_steps() -> None:
     found, expected = (result[4]["episode_metrics"] for result in both)
     for name in ("pelvis_error_rms_rad", "zmp_deviation_rms_m", "foot_drift_end_m"):
         assert found[name] == pytest.approx(expected[name], rel=2e-2), name
-    assert one[4]["time_s"] == pytest.approx(other[4]["time_s"] + 6 * STEP_S)
+    assert one[4]["time_s"] == pytest.approx(other[4]["time_s"] + 4 * STEP_S)
 
 
 def test_numbers_of_steps_are_drawn_per_episode_evenly_and_by_its_seed() -> None:
@@ -69,8 +72,8 @@ def test_numbers_of_steps_are_drawn_per_episode_evenly_and_by_its_seed() -> None
     env = make_walk_vector(num_envs=200, **DRAWN, scenario="ideal")
     env.reset(seed=0)
     drawn = skipped(env)
-    numbers, counts = np.unique(10 - drawn // ROWS, return_counts=True)
-    assert numbers.tolist() == [4, 6, 8, 10]
+    numbers, counts = np.unique(8 - drawn // ROWS, return_counts=True)
+    assert numbers.tolist() == [4, 6, 8]
     assert counts.min() > 30
     env.reset()
     assert (skipped(env) != drawn).mean() > 0.6
@@ -86,7 +89,7 @@ def test_numbers_of_steps_are_drawn_per_episode_evenly_and_by_its_seed() -> None
 def test_the_robot_does_not_depend_on_whether_the_number_of_steps_is_drawn() -> None:
     """Catches a draw in front of the others."""
     robots = []
-    for options in (DRAWN, {"step_period": STEP_S, "num_steps": 10}):
+    for options in (DRAWN, {"step_period": STEP_S, "num_steps": 8}):
         env = make_walk(**options, scenario="spread")
         env.reset(seed=4)
         robots.append(env.unwrapped.task.truth().stiffness)
@@ -117,7 +120,7 @@ def test_a_control_step_of_physics_of_2_ms_is_nearly_that_of_1_ms() -> None:
     assert coarse.unwrapped.task.num_substeps * 2 == fine.unwrapped.task.num_substeps == 4
     for env in (fine, coarse):
         env.reset(seed=0)
-    policy = baselines.make("foothold", fine)
+    policy = baselines.make("input_output", fine)
     observation, _ = fine.reset(seed=0)
     state = None
     apart = []

@@ -132,10 +132,10 @@ def test_vector_actions_are_the_scalar_ones_row_by_row(name: str) -> None:
     of the batch."""
     worlds = vector(name)
     world = scalar(name=name)
-    _, together = run(baselines.make(name, worlds), worlds, 25, seed=21)
+    _, together = run(baselines.make(name, worlds), worlds, 15, seed=21)
     assert together.dtype == np.float32
     for number in range(2):
-        _, alone = run(baselines.make(name, world), world, 25, seed=21 + number)
+        _, alone = run(baselines.make(name, world), world, 15, seed=21 + number)
         np.testing.assert_array_equal(together[:, number], alone)
     assert (name == "zero") == (not together.any())
 

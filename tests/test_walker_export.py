@@ -13,6 +13,7 @@ import baselines
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
 from tests.test_c_export import (
+    AS_RELEASED,
     CHECKED,
     COMPILERS,
     QUICKLY,
@@ -225,23 +226,29 @@ def test_it_needs_no_heap(policy: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("policy", BOTH)
 @pytest.mark.parametrize("compiler", COMPILERS)
+@pytest.mark.parametrize("options", AS_RELEASED)
 def test_the_command_writes_it(
     policy: str,
     compiler: str,
+    options: str,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """Catches an example of another header, and what is not there in C."""
+    """Catches an example of another header, and what is not there in C; at night also an option
+    that is ignored, for which a walk is planned."""
     monkeypatch.chdir(tmp_path)
     main(["export", "c", policy, "--prefix", "arm", "-o", "arm.h", "--example"])
     example = Path("arm_example/arm_main.c").read_text()
     folder = tmp_path / "arm_example"
-    program = compiled(folder, Path("arm.h").read_text(), compiler, example, RELEASED)
+    program = compiled(folder, Path("arm.h").read_text(), compiler, example, options)
     said = subprocess.run([program], capture_output=True, text=True, check=True).stdout
     assert "us per control step" in said
     capsys.readouterr()
-    for wrong, named in ((["--env", "testbed"], policy), (["--ramp-s", "2"], "--ramp-s")):
+    refused = [(["--env", "testbed"], policy)]
+    if options == RELEASED:
+        refused += [(["--ramp-s", "2"], "--ramp-s")]
+    for wrong, named in refused:
         with pytest.raises(SystemExit):
             main(["export", "c", policy, *wrong])
         assert named in capsys.readouterr().err

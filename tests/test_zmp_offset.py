@@ -20,11 +20,11 @@ OFFSET_M = np.array([0.011, -0.004])
 STEPS = 500
 
 
-def vector(scenario: str = "nominal") -> Any:
-    """Two worlds of the walker at 3 s."""
+def vector(scenario: str = "nominal", num_envs: int = 2) -> Any:
+    """Worlds of the walker at 3 s."""
     return gymnasium.make_vec(
         "elastic_env/WalkInPlace-v0",
-        num_envs=2,
+        num_envs=num_envs,
         vectorization_mode="vector_entry_point",
         scenario=scenario,
         num_threads=1,
@@ -94,23 +94,27 @@ def test_a_constant_error_is_integrated_up_to_the_limit() -> None:
 
 
 def test_on_a_slope_the_mean_error_of_the_zmp_goes() -> None:
-    """Catches an integral that the body does not follow, and one that is never built in."""
-    left = {}
-    for offset in (None, {"time_constant_s": 1.0}):
-        env = vector("slope")
-        policy = baselines.make("adaptive_posture", env, zmp_offset=offset)
-        observation, _ = env.reset(seed=3)
-        state = None
-        start = np.ones(2, dtype=np.bool_)
-        deviations = []
-        for _ in range(950):
-            action, state = policy.predict(observation, state, start)
-            observation, *_, info = env.step(action)
-            start = np.zeros(2, dtype=np.bool_)
-            deviations.append([info["zmp_deviation_x"], info["zmp_deviation_y"]])
-        left[offset is None] = np.linalg.norm(np.nanmean(deviations[650:], axis=0), axis=0)
-    assert (left[True] > 5e-3).all()
-    assert (left[False] < 0.5 * left[True]).all()
+    """Catches an integral that the body does not follow, and one that is never built in: two
+    robots with the offset beside the same two without."""
+    env = vector("slope", 4)
+    policies = [
+        baselines.make("adaptive_posture", env, zmp_offset=offset)
+        for offset in (None, {"time_constant_s": 1.0})
+    ]
+    observation, _ = env.reset(seed=[3, 4, 3, 4])
+    states: list[Any] = [None, None]
+    deviations = []
+    for step in range(950):
+        actions = []
+        for i, rows in enumerate(np.split(observation, 2)):
+            action, states[i] = policies[i].predict(rows, states[i], np.full(2, step == 0))
+            actions.append(action)
+        observation, *_, info = env.step(np.concatenate(actions))
+        deviations.append([info["zmp_deviation_x"], info["zmp_deviation_y"]])
+    mean = np.linalg.norm(np.nanmean(deviations[650:], axis=0), axis=0)
+    plain, shifted = np.split(mean, 2)
+    assert (plain > 5e-3).all()
+    assert (shifted < 0.5 * plain).all()
 
 
 def test_gains_that_are_not_named_keep_the_values_of_the_policy() -> None:
