@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from elastic_env.joint.elastic_joint import ElasticJoint, Servo
     from elastic_env.joint.make_elastic import make_elastic
     from elastic_env.joint.motor import Motor
+    from elastic_env.joint.mujoco_friction import VaryingFriction
     from elastic_env.joint.small_servos import small_servo
-    from elastic_env.joint.varying_friction import VaryingFriction
     from elastic_env.robots.joint_robot import JointRobot
 
 __version__ = "0.1.0"
@@ -52,7 +52,7 @@ _MODULES = {
     "JointRobot": "elastic_env.robots.joint_robot",
     "Motor": "elastic_env.joint.motor",
     "Servo": "elastic_env.joint.elastic_joint",
-    "VaryingFriction": "elastic_env.joint.varying_friction",
+    "VaryingFriction": "elastic_env.joint.mujoco_friction",
     "make_elastic": "elastic_env.joint.make_elastic",
     "small_servo": "elastic_env.joint.small_servos",
 }

@@ -61,15 +61,15 @@ _TRAJECTORY = "elastic_env/motion/trajectory.py"
 _STATISTICS = "train/evaluate/statistics.py"
 
 BROKEN = (
-    BrokenFormula(_ELASTICITY, "np.asarray(backlash) / 2.0", "np.asarray(backlash)", JOINT),
     BrokenFormula(
-        _ELASTICITY, "deflection + damping * deflection_rate", "deflection + damping", JOINT
+        _ELASTICITY, "np.abs(deflection) - backlash / 2.0", "np.abs(deflection) - backlash", JOINT
     ),
+    BrokenFormula(_ELASTICITY, "wound + damping * deflection_rate", "wound + damping", JOINT),
     BrokenFormula(
         _ELASTICITY, "np.sign(torque) * backlash / 2.0", "np.sign(torque) * backlash", JOINT
     ),
     BrokenFormula(
-        _ELASTICITY,
+        "elastic_env/joint/elastic_joint.py",
         "self.torque_limit + self.braking * self.speed_limit",
         "self.torque_limit + self.braking",
         f"{JOINT} sensors testbed",
@@ -124,13 +124,13 @@ BROKEN = (
         "elastic_env/joint/friction.py",
         "1.0 - direction * load_ratio * np.sign(needed)",
         "1.0 - direction * load_ratio",
-        "varying_friction dry_friction",
+        "mujoco_friction dry_friction",
     ),
     BrokenFormula(
-        "elastic_env/joint/varying_friction.py",
+        "elastic_env/joint/mujoco_friction.py",
         "ends[1] - ends[0]",
         "ends[1]",
-        "varying_friction",
+        "mujoco_friction",
     ),
     BrokenFormula(
         _COMPENSATORS,

@@ -13,9 +13,8 @@ import elastic_env  # noqa: F401  registers the environments
 from baselines.adaptation.estimators import StiffnessPrior, mean_load, regress
 from baselines.adaptation.online_stiffness import AdaptationGains, OnlineStiffness
 from baselines.compensation.dry_friction import PRESLIDING_RAD, presliding_friction
-from baselines.compensation.inputs import PolicyInputs
 from baselines.compensation.measured import DeflectionSensors
-from baselines.compensation.policy import Zero
+from baselines.compensation.policy import PolicyInputs, Zero
 from baselines.policies import sensors_needed
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array

@@ -33,7 +33,7 @@ from train.evaluate.change_text import CEILING, SAME_ROBOT, percent_interval
 from train.evaluate.changes import Change, changes
 from train.evaluate.conditions import Condition, Member, PolicySpec
 from train.evaluate.episodes import Evaluation, evaluate, merge_seeds
-from train.evaluate.progress import learning_curves
+from train.evaluate.learning_curves import learning_curves
 from train.evaluate.residual_seeds import expand
 from train.evaluate.scores import match_episodes, pair, score
 from train.evaluate.statistics import (

@@ -22,7 +22,7 @@ from baselines.compensation.dynamic_compensator import DriveMemory, DynamicCompe
 from baselines.compensation.gravity_torque import RigidBody, make_gravity
 from elastic_env.core.errors import ConfigurationError, ElasticError
 from elastic_env.core.signals import Array
-from elastic_env.joint.elasticity import ElasticJoint, Servo
+from elastic_env.joint.elastic_joint import ElasticJoint, Servo
 from elastic_env.robots.testbed.model import JOINT, Pendulum, elastic_spec, rigid_spec
 from elastic_env.world.robot_model import RobotModel
 from tests.trees import bias_of_mujoco, pendulum, robot, tree

@@ -27,7 +27,7 @@ from rich.console import Console
 import elastic_env  # noqa: F401  registers the environments
 from elastic_env.core import compiled as module
 from elastic_env.core.compiled import compile_now, compiled
-from elastic_env.world import attitude_kernels, joint_kernels, walk_kernels
+from elastic_env.world import attitude_kernels, joint_kernels, walk_kernels, walk_reward
 from train.runs.progress import announce_compilation
 
 ROOT = Path(__file__).parents[1]
@@ -35,9 +35,10 @@ KERNELS = (
     "elastic_env.world.joint_kernels",
     "elastic_env.world.attitude_kernels",
     "elastic_env.world.walk_kernels",
+    "elastic_env.world.walk_reward",
     "elastic_env.joint.elasticity",
     "elastic_env.joint.friction",
-    "elastic_env.joint.varying_friction",
+    "elastic_env.joint.mujoco_friction",
     "elastic_env.world.metrics",
     "elastic_env.rigid.tree.kernels",
     "baselines.compensation.filters",
@@ -344,7 +345,7 @@ def test_a_compiled_control_step_does_what_its_python_code_says(
 
     compiled_ones = [
         (file, name, function)
-        for file in (attitude_kernels, joint_kernels, walk_kernels)
+        for file in (attitude_kernels, joint_kernels, walk_kernels, walk_reward)
         for name, function in vars(file).items()
         if hasattr(function, "py_func")
     ]

@@ -5,7 +5,7 @@ import pytest
 
 import baselines
 from baselines.compensation.compiled_rows import record_row
-from baselines.compensation.inputs import PolicyInputs
+from baselines.compensation.policy import PolicyInputs
 from baselines.walking.dcm_observer import (
     OBSERVED,
     DcmObserver,

@@ -13,8 +13,8 @@ from scipy import optimize
 
 from elastic_env.core.errors import ConfigurationError, ElasticError
 from elastic_env.core.signals import Array
+from elastic_env.joint.elastic_joint import ElasticJoint
 from elastic_env.joint.elasticity import (
-    ElasticJoint,
     joint_torque,
     solve_stiffness,
     static_deflection,

@@ -6,8 +6,7 @@ import gymnasium
 import numpy as np
 
 import elastic_env  # noqa: F401  registers the environments
-from baselines.compensation.inputs import PolicyInputs
-from baselines.compensation.policy import Zero
+from baselines.compensation.policy import PolicyInputs, Zero
 from baselines.walking.foot_tare import FootTare, FootTareGains, unloaded_wrench
 from elastic_env.core.signals import Array
 from elastic_env.world.robot_model import RobotModel

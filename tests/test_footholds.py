@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 import baselines
 import elastic_env  # noqa: F401  registers the environments
-from baselines.compensation.compiled_rows import WalkView
 from baselines.compensation.contact_torque import ContactGravity, planned_feet, shift_plan
+from baselines.compensation.policy import WalkView
 from baselines.walking.controller import WalkingController
 from baselines.walking.flat_feet import FlatFeet
 from baselines.walking.zmp_shift import Stances, move_pelvis

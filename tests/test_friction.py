@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from elastic_env.core.errors import ConfigurationError
-from elastic_env.joint.elasticity import ElasticJoint, Servo
+from elastic_env.joint.elastic_joint import ElasticJoint, Servo
 from elastic_env.joint.friction import dry_friction
 from elastic_env.joint.motor import Motor, motor_torque, terminal_speed
 

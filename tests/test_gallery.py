@@ -19,7 +19,7 @@ import pytest
 from docs.pages.gallery import AtRest, measure
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
-from elastic_env.joint.elasticity import ElasticJoint
+from elastic_env.joint.elastic_joint import ElasticJoint
 from elastic_env.joint.joint_names import motor_name
 from elastic_env.joint.make_elastic import make_elastic, transform_hinges
 from elastic_env.joint.model_joints import hinges_of

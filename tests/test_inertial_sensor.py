@@ -14,6 +14,7 @@ from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
 from elastic_env.robots.thormang.environment import make_vector
 from elastic_env.robots.thormang.records import TRUTH
+from elastic_env.world import attitude_kernels
 from elastic_env.world import walk_kernels as kernels
 from elastic_env.world.scenario import make_scenario
 from elastic_env.world.sensors import AttitudeSensor, InertialSensor
@@ -37,7 +38,9 @@ def filtered(up: Array, rate: Array, force: Array, duration_s: float, tau_s: flo
     up = up.copy()
     period_s = 0.004
     for _ in range(round(duration_s / period_s)):
-        kernels.complementary_filter(up, rate * period_s, force, 1.0 - math.exp(-period_s / tau_s))
+        attitude_kernels.complementary_filter(
+            up, rate * period_s, force, 1.0 - math.exp(-period_s / tau_s)
+        )
     return up
 
 
@@ -51,7 +54,7 @@ def test_an_acceleration_tilts_the_attitude_as_a_first_order_lag(time_s: float) 
     a = 0.5
     tau = 10.0
     up = filtered(np.array([0.0, 0.0, 1.0]), np.zeros(3), np.array([0.0, a, G]), time_s, tau)
-    roll, pitch, _ = kernels.attitude_from_vertical(*up)
+    roll, pitch, _ = attitude_kernels.attitude_from_vertical(*up)
     end = math.atan2(a, G)
     exact = end - 2.0 * math.atan(math.tan(end / 2.0) * math.exp(-time_s / tau))
     assert roll == pytest.approx(exact, rel=1e-6)
@@ -72,10 +75,14 @@ def test_a_bias_of_the_gyroscope_tilts_it_by_bias_times_time_constant(
     for time_s in (1.0, 10.0, 60.0):
         up = filtered(np.array([0.0, 0.0, 1.0]), bias, force, time_s, tau)
         expected = 1e-3 * tau * (1.0 - math.exp(-time_s / tau))
-        assert kernels.attitude_from_vertical(*up)[angle] == pytest.approx(expected, rel=1e-3)
-        assert kernels.attitude_from_vertical(*up)[1 - angle] == pytest.approx(0.0, abs=1e-9)
+        assert attitude_kernels.attitude_from_vertical(*up)[angle] == pytest.approx(
+            expected, rel=1e-3
+        )
+        assert attitude_kernels.attitude_from_vertical(*up)[1 - angle] == pytest.approx(
+            0.0, abs=1e-9
+        )
     settled = np.empty(3)
-    kernels.settled_vertical(settled, force, bias, tau)
+    attitude_kernels.settled_vertical(settled, force, bias, tau)
     np.testing.assert_allclose(settled, filtered(settled, bias, force, 10.0, tau), atol=5e-6)
 
 
@@ -86,7 +93,7 @@ def test_the_gyroscope_alone_follows_any_rotation() -> None:
     R = Rotation.identity()
     for turned in rng.normal(scale=0.3, size=(50, 3)):
         R = R * Rotation.from_rotvec(turned)
-        kernels.complementary_filter(up, turned, np.zeros(3), 0.0)
+        attitude_kernels.complementary_filter(up, turned, np.zeros(3), 0.0)
     np.testing.assert_allclose(up, R.inv().apply([0.0, 0.0, 1.0]), atol=1e-12)
 
 
@@ -99,7 +106,7 @@ def test_the_mean_rate_is_that_of_the_rotation_between_two_attitudes() -> None:
         a, b = (np.roll(R.as_quat(), 1) for R in (before, after))
         found = np.empty(3)
         for sign in (1.0, -1.0):
-            kernels.rotation_between(a, sign * b, found)
+            attitude_kernels.rotation_between(a, sign * b, found)
             np.testing.assert_allclose(found, turned, atol=1e-12)
 
 
@@ -119,7 +126,7 @@ def test_a_tilted_sensor_at_rest_feels_gravity() -> None:
     row = truth(R, np.zeros(3))
     kernels.specific_force(row, row, 0.004, G, force)
     np.testing.assert_allclose(force, R.inv().apply([0.0, 0.0, G]), atol=1e-12)
-    roll, pitch, _ = kernels.attitude_from_vertical(*(force / G))
+    roll, pitch, _ = attitude_kernels.attitude_from_vertical(*(force / G))
     assert (roll, pitch) == pytest.approx((0.3, -0.2))
 
 

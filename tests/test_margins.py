@@ -18,7 +18,7 @@ from train.commands import margins as command
 from train.commands.cli import main
 from train.evaluate.conditions import Condition, PolicySpec
 from train.evaluate.episodes import evaluate
-from train.evaluate.margins import (
+from train.evaluate.margin_search import (
     CHECKED_SHARE,
     NO_REST,
     QUANTITIES,

@@ -11,8 +11,7 @@ import pytest
 
 import baselines
 import elastic_env  # noqa: F401  registers the environments
-from baselines.compensation.inputs import PolicyInputs
-from baselines.compensation.policy import Zero
+from baselines.compensation.policy import PolicyInputs, Zero
 from baselines.walking.phase_table import (
     CHANNELS,
     MOST_HARMONICS,

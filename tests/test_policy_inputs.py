@@ -14,7 +14,8 @@ import pytest
 import baselines
 from baselines.catalogue import ON_JOINTS, ON_THE_WALKER
 from baselines.compensation.contact_torque import shifted_share
-from baselines.compensation.inputs import INPUTS, PolicyInputs, input_signals, inputs_of
+from baselines.compensation.inputs import INPUTS, input_signals, inputs_of
+from baselines.compensation.policy import PolicyInputs
 from baselines.policies import sensors_needed
 from baselines.residual.correction import Corrected
 from baselines.residual.features import Features

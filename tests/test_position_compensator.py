@@ -20,7 +20,7 @@ from baselines.compensation.compensators import input_offset, newton_link_angle
 from baselines.compensation.gravity_torque import make_gravity
 from elastic_env.core.errors import ActionError, ConfigurationError, ElasticError
 from elastic_env.core.signals import Array
-from elastic_env.joint.elasticity import ElasticJoint, Servo
+from elastic_env.joint.elastic_joint import ElasticJoint, Servo
 from elastic_env.joint.joint_names import JointAddresses
 from elastic_env.joint.make_elastic import make_elastic
 from tests.trees import ORDER, TREE, tree

@@ -10,7 +10,7 @@ import pytest
 from baselines import PositionCompensator
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
-from elastic_env.joint.elasticity import ElasticJoint, Servo
+from elastic_env.joint.elastic_joint import ElasticJoint, Servo
 from elastic_env.joint.make_elastic import transform_hinges
 from elastic_env.joint.motor import Motor
 from elastic_env.motion.trajectory import minimum_jerk

@@ -14,7 +14,7 @@ import pytest
 from numba.cuda import libdevicefuncs
 
 import elastic_env  # noqa: F401  registers the environments
-from elastic_env.world import attitude_kernels, joint_kernels, walk_kernels
+from elastic_env.world import attitude_kernels, joint_kernels, walk_kernels, walk_reward
 from tests.ptx import TARGET, ptx_of
 
 WALKER = "elastic_env/WalkInPlace-v0"
@@ -69,7 +69,7 @@ def test_a_control_step_compiles_to_ptx(
         assert records
         assert all(kind.isalignedstruct for kind in records)
         kinds = tuple(map(numba.typeof, given[:-2]))
-        ptx = ptx_of(kernel, kinds, attitude_kernels, joint_kernels, walk_kernels)
+        ptx = ptx_of(kernel, kinds, attitude_kernels, joint_kernels, walk_kernels, walk_reward)
         assert f".target {TARGET}" in ptx
         assert len(re.findall(r"^\.visible \.entry", ptx, re.MULTILINE)) == 1
         missing = set(re.findall(r"^\.extern \.func .*?(\w+)$", ptx, re.MULTILINE))

@@ -11,12 +11,12 @@ import pytest
 
 import baselines
 import elastic_env  # noqa: F401  registers the environments
-from baselines.compensation.inputs import NO_INPUTS
+from baselines.compensation.policy import NO_INPUTS
 from baselines.identification.servo_file import is_servo_log
 from baselines.identification.servo_log import read_servo_log
 from elastic_env.core.config import quantity
 from elastic_env.core.errors import ConfigurationError
-from elastic_env.joint.varying_friction import VaryingFriction
+from elastic_env.joint.mujoco_friction import VaryingFriction
 from elastic_env.robots.robot.environment import EXAMPLE
 from elastic_env.robots.robot.joints import home_of_joints
 from elastic_env.world.joint_config import RewardWeights

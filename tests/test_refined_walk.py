@@ -10,8 +10,7 @@ import baselines
 import elastic_env  # noqa: F401  registers the environments
 from baselines.compensation.compensators import Compensated
 from baselines.compensation.dynamic_compensator import DynamicCompensator
-from baselines.compensation.inputs import PolicyInputs
-from baselines.compensation.policy import Zero
+from baselines.compensation.policy import PolicyInputs, Zero
 from baselines.walking.controller import WalkingController
 from baselines.walking.refined_plan import RefinedWalk, refine_model
 from elastic_env.core.signals import Array

@@ -19,7 +19,7 @@ from elastic_env.robots.testbed.config import TestbedConfig
 from elastic_env.robots.testbed.model import Pendulum
 from elastic_env.world.robot_model import RobotModel
 from elastic_env.world.worlds import SingleWorld
-from tests.test_varying_friction import rigid_spec
+from tests.test_mujoco_friction import rigid_spec
 
 SHEETS = {
     "XL330-M288": (0.52, 103.0),

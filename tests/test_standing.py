@@ -11,7 +11,7 @@ import pytest
 
 from elastic_env.core.errors import ElasticError
 from elastic_env.core.signals import Array
-from elastic_env.joint.elasticity import ElasticJoint
+from elastic_env.joint.elastic_joint import ElasticJoint
 from elastic_env.joint.joint_names import JointAddresses
 from elastic_env.robots.thormang.model import LEG_JOINTS, SIDES, Thormang, biped, elastic_spec
 from elastic_env.robots.thormang.standing import Equilibrium, settle

@@ -19,7 +19,7 @@ import elastic_env  # noqa: F401  registers the environments
 from elastic_env.core.errors import ActionError, ConfigurationError
 from elastic_env.core.signals import Array
 from elastic_env.joint.dynamixel import ENCODER_COUNTS_PER_TURN, H54_200_S500_R
-from elastic_env.joint.elasticity import Servo
+from elastic_env.joint.elastic_joint import Servo
 from elastic_env.motion.references import Hold, Sine
 from elastic_env.motion.trajectory import STAND_S
 from elastic_env.robots.testbed import environment as testbed

@@ -12,7 +12,7 @@ import pytest
 
 import elastic_env  # noqa: F401  registers the environments
 from elastic_env.core.errors import ConfigurationError
-from elastic_env.joint.elasticity import ElasticJoint, Servo
+from elastic_env.joint.elastic_joint import ElasticJoint, Servo
 from elastic_env.joint.make_elastic import make_elastic, transform_hinges
 from elastic_env.joint.time_step import largest_stable_timestep
 

@@ -33,7 +33,7 @@ from elastic_env.world.vector_env import ElasticVectorEnv
 from train.commands.bench import BenchCase
 from train.commands.cli import main
 from train.evaluate.episodes import evaluate
-from train.evaluate.progress import read_progress
+from train.evaluate.learning_curves import read_progress
 from train.evaluate.rollout import make_vector_env
 from train.learn.constant_search import ConstantSearch
 from train.learn.mixed_env import MixedVectorEnv, thread_counts

@@ -28,7 +28,7 @@ from elastic_env.robots.thormang.environment import make_vector as make_walk_vec
 from elastic_env.world.env import ElasticEnv
 from elastic_env.world.scenario import make_scenario
 from elastic_env.world.vector_env import ElasticVectorEnv
-from elastic_env.world.walk_kernels import distance_penalty, tilt_penalty
+from elastic_env.world.walk_reward import distance_penalty, tilt_penalty
 from tests.docstrings import documented_tables
 
 ID = "elastic_env/WalkInPlace-v0"

@@ -737,14 +737,15 @@ def leaning(env: Any) -> Leaning:
     return Leaning()
 
 
-def test_raw_stepping_walks_as_the_environment_does() -> None:
+@pytest.mark.parametrize("steps", [120, pytest.param(500, marks=pytest.mark.slow)])
+def test_raw_stepping_walks_as_the_environment_does(steps: int) -> None:
     """Catches a benchmark that compares unequal work: the raw worlds must end where the
     environment's end, exactly."""
     loop = VectorLoop("walker", 3, 1, "input_wrench", residual=True)
     inside = loop.env.unwrapped
     raw = RawWorlds(loop, threads=2)
-    loop.run(120)
-    raw.run(120)
+    loop.run(steps)
+    raw.run(steps)
     data = mujoco.MjData(inside.task.model)
     kind = int(mujoco.mjtState.mjSTATE_INTEGRATION)
     for state, qpos, qvel in zip(

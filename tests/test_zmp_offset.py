@@ -8,8 +8,7 @@ import pytest
 
 import baselines
 import elastic_env  # noqa: F401  registers the environments
-from baselines.compensation.inputs import PolicyInputs
-from baselines.compensation.policy import Zero
+from baselines.compensation.policy import PolicyInputs, Zero
 from baselines.walking.zmp_offset import ZmpOffset, ZmpOffsetGains
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array

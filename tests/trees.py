@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 
 from elastic_env.core.signals import Array
-from elastic_env.joint.elasticity import ElasticJoint
+from elastic_env.joint.elastic_joint import ElasticJoint
 from elastic_env.robots.testbed.model import JOINT, Pendulum, rigid_spec
 from elastic_env.world.robot_model import RobotModel
 

@@ -45,9 +45,8 @@ from typing_extensions import override
 from baselines.compensation.compensators import GravityCompensator
 from baselines.compensation.dry_friction import presliding_friction
 from baselines.compensation.filters import filter_share
-from baselines.compensation.inputs import PolicyInputs
 from baselines.compensation.measured import require_sensor
-from baselines.compensation.policy import Step
+from baselines.compensation.policy import PolicyInputs, Step
 from baselines.compensation.policy_around import PolicyAround
 from baselines.compensation.ramp import Ramp
 from elastic_env.core.config import Model, quantity

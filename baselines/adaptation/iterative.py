@@ -15,8 +15,7 @@ from typing_extensions import override
 
 from baselines.adaptation.learned_signals import LearnedSignals
 from baselines.adaptation.learning_law import limit_surprise, update
-from baselines.compensation.inputs import PolicyInputs
-from baselines.compensation.policy import Policy, Step
+from baselines.compensation.policy import Policy, PolicyInputs, Step
 from baselines.compensation.policy_around import MemoryAround, PolicyAround
 from baselines.compensation.ramp import Ramp
 from elastic_env.core.errors import ElasticError

@@ -14,9 +14,8 @@ import numpy as np
 from typing_extensions import override
 
 from baselines.compensation.filters import filter_share
-from baselines.compensation.inputs import PolicyInputs
 from baselines.compensation.memory_rows import put_rows, select_rows
-from baselines.compensation.policy import Step
+from baselines.compensation.policy import PolicyInputs, Step
 from baselines.compensation.policy_around import PolicyAround
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array, IntArray

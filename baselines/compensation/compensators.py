@@ -11,12 +11,11 @@ from typing import Any, Literal, NamedTuple, Protocol, TypeVar, get_args
 import numpy as np
 from typing_extensions import override
 
-from baselines.compensation.compiled_rows import WalkView
 from baselines.compensation.contact_torque import WrenchTorque, planned_feet, shift_plan
 from baselines.compensation.gravity_torque import GravityMethod, GravityModel, make_gravity
-from baselines.compensation.inputs import DEFLECTION, PolicyInputs
+from baselines.compensation.inputs import DEFLECTION
 from baselines.compensation.memory_rows import put_rows, select_rows
-from baselines.compensation.policy import Motion, Policy, Step
+from baselines.compensation.policy import Motion, Policy, PolicyInputs, Step, WalkView
 from baselines.compensation.policy_around import PolicyAround
 from baselines.compensation.ramp import Ramp
 from elastic_env.core.errors import ConfigurationError, require_known

@@ -17,8 +17,8 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from baselines.compensation.compiled_rows import WalkView, record_row, record_rows
-from baselines.compensation.policy import ObservationView
+from baselines.compensation.compiled_rows import record_row, record_rows
+from baselines.compensation.policy import ObservationView, WalkView
 from elastic_env.core.compiled import compiled, compiled_part
 from elastic_env.core.signals import Array
 from elastic_env.motion.walk_plan import WalkPlan

@@ -10,9 +10,9 @@ walker in the plan's local frame (`elastic_env.motion.walk_plan`).
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
-from elastic_env.core.signals import Array, Mirrored, Signal
+from elastic_env.core.signals import Mirrored, Signal
 from elastic_env.world.robot_model import RobotModel
 
 COMMAND = "command"
@@ -81,41 +81,3 @@ def input_signals(name: str, model: RobotModel) -> tuple[Signal, ...]:
 def inputs_of(policy: Any) -> tuple[str, ...]:
     """Names of the inputs that a policy has."""
     return (COMMAND, *getattr(policy, "inputs", ()))
-
-
-class PolicyInputs(NamedTuple):
-    """Values of a policy's inputs, (num_worlds, columns) each; None for an input without a value.
-
-    A policy uses its own inputs and passes the others on. `baselines.compensation.inputs` describes
-    them. `command` is no field: it is added to the command of any policy. `load` is no input: it is
-    the mean excess load μ within `deflection`, (num_worlds, 1) [1]. The last two fields are
-    arguments of `predict`, for policies of users.
-    """
-
-    deflection: Array | None = None
-    load: Array | None = None
-    zmp: Array | None = None
-    com: Array | None = None
-    leg_length: Array | None = None
-    hip: Array | None = None
-    posture_gain: Array | None = None
-    balance_gain: Array | None = None
-    is_single: bool = False
-    deterministic: bool = True
-
-    @property
-    def zmp_shift(self) -> Array | None:
-        """Shift of the planned ZMP, (num_worlds, 2) [m]; None without.
-
-        A constant shift of the center of mass shifts the ZMP too.
-        """
-        if self.zmp is None or self.com is None:
-            return self.com if self.zmp is None else self.zmp
-        return self.zmp + self.com
-
-
-NO_INPUTS = PolicyInputs()
-
-
-ONE_WORLD = PolicyInputs(is_single=True)
-"""Empty inputs, for many worlds and for one."""

@@ -7,8 +7,6 @@ from elastic_env.rigid.rigid_body import RigidBody
 
 _POSES = 500
 """Random poses of the search for the largest gravity torque."""
-
-
 _TRIES = 33
 """Angles that the search tries for each joint of the best of them."""
 

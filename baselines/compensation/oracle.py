@@ -12,8 +12,7 @@ from typing_extensions import override
 
 from baselines.compensation.compensators import Compensated
 from baselines.compensation.dynamic_compensator import DriveMemory, DynamicCompensator
-from baselines.compensation.inputs import PolicyInputs
-from baselines.compensation.policy import Motion, Policy, Step
+from baselines.compensation.policy import Motion, Policy, PolicyInputs, Step
 from baselines.compensation.policy_around import PassingMemory
 from baselines.compensation.ramp import Ramp
 from elastic_env.core.errors import ElasticError

@@ -17,10 +17,10 @@ import numpy as np
 import numpy.typing as npt
 from typing_extensions import override
 
-from baselines.compensation.inputs import NO_INPUTS, ONE_WORLD, PolicyInputs
+from baselines.compensation.compiled_rows import Records
 from baselines.compensation.memory_rows import put_rows, select_rows
 from elastic_env.core.errors import ElasticError, unknown_name
-from elastic_env.core.signals import Array, BoolArray, IntArray, Signal
+from elastic_env.core.signals import Array, BoolArray, IntArray, Signal, SignalTable
 from elastic_env.world.robot_model import RobotModel
 
 
@@ -106,6 +106,47 @@ class ObservationView:
         return is_at_rest & (is_reference | (command == 0.0).all(axis=1))
 
 
+_WALK_FIELDS: Mapping[str, tuple[int, ...]] = {
+    "encoder_angle": (12,),
+    "encoder_rate": (12,),
+    "imu_attitude": (2,),
+    "imu_rate": (3,),
+    "wrench": (2, 2, 3),
+    "reference_angle": (12,),
+    "reference_rate": (12,),
+    "clock": (3,),
+    "load_share": (),
+    "zmp_reference": (2,),
+}
+"""Groups of a walker's observation, and the shapes of their fields; wrench: feet, force and
+moment, axes.
+"""
+
+
+class WalkView:
+    """Observations of a walker as rows with named fields, as compiled kernels read them.
+
+    Args:
+        table: Columns of the observation.
+    """
+
+    def __init__(self, table: SignalTable) -> None:
+        groups = [table.group(name) for name in _WALK_FIELDS]
+        layout = {
+            "names": list(_WALK_FIELDS),
+            "formats": [(np.float64, shape) for shape in _WALK_FIELDS.values()],
+            "offsets": [8 * group.start for group in groups],
+            # without the columns behind them, so that one kernel fits all walkers
+            "itemsize": 8 * max(group.stop for group in groups),
+        }
+        self._type = np.dtype((np.record, layout))
+
+    def fields(self, rows: Array) -> Records:
+        """Observations, (num_worlds, m), as rows with fields, (num_worlds,), in the same memory."""
+        rows = np.ascontiguousarray(rows)
+        return np.ndarray(len(rows), self._type, rows, 0, rows.strides[:1])
+
+
 Action = npt.NDArray[np.float32]
 Step: TypeAlias = tuple[Array, Any]
 """Offsets of the joints, (num_worlds, n) [rad], and the memory after a control step."""
@@ -123,6 +164,42 @@ class Policy(Protocol):
     ) -> tuple[Any, Any]:
         """Action and new state for an observation."""
         ...
+
+
+class PolicyInputs(NamedTuple):
+    """Values of a policy's inputs, (num_worlds, columns) each; None for an input without a value.
+
+    A policy uses its own inputs and passes the others on. `baselines.compensation.inputs` describes
+    them. `command` is no field: it is added to the command of any policy. `load` is no input: it is
+    the mean excess load μ within `deflection`, (num_worlds, 1) [1]. The last two fields are
+    arguments of `predict`, for policies of users.
+    """
+
+    deflection: Array | None = None
+    load: Array | None = None
+    zmp: Array | None = None
+    com: Array | None = None
+    leg_length: Array | None = None
+    hip: Array | None = None
+    posture_gain: Array | None = None
+    balance_gain: Array | None = None
+    is_single: bool = False
+    deterministic: bool = True
+
+    @property
+    def zmp_shift(self) -> Array | None:
+        """Shift of the planned ZMP, (num_worlds, 2) [m]; None without.
+
+        A constant shift of the center of mass shifts the ZMP too.
+        """
+        if self.zmp is None or self.com is None:
+            return self.com if self.zmp is None else self.zmp
+        return self.zmp + self.com
+
+
+NO_INPUTS = PolicyInputs()
+ONE_WORLD = PolicyInputs(is_single=True)
+"""Empty inputs, for many worlds and for one."""
 
 
 class BatchPolicy(ABC):

@@ -21,7 +21,8 @@ from typing import Any
 import numpy as np
 
 from baselines.compensation.compensators import GravityCompensator
-from baselines.compensation.compiled_rows import Records, WalkView
+from baselines.compensation.compiled_rows import Records
+from baselines.compensation.policy import WalkView
 from elastic_env.core.compiled import compiled, compiled_part, record_type
 from elastic_env.core.signals import Array, Signal
 from elastic_env.world.robot_model import WalkerModel

@@ -13,7 +13,7 @@ from baselines.identification.results import save_result, stiffness_ends, stiffn
 from baselines.identification.rotations import rotation_of
 from elastic_env.core.config import Model
 from elastic_env.core.errors import ConfigurationError
-from elastic_env.core.rotations import matrix_of, quaternion_of
+from elastic_env.core.quaternions import matrix_of, quaternion_of
 from elastic_env.rigid.tree.links import Tree
 
 

@@ -12,16 +12,15 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-from baselines.compensation.inputs import (
-    COMMAND,
-    INPUTS,
+from baselines.compensation.inputs import COMMAND, INPUTS, InputKind, input_signals, inputs_of
+from baselines.compensation.policy import (
     NO_INPUTS,
     ONE_WORLD,
-    InputKind,
-    input_signals,
-    inputs_of,
+    Action,
+    Step,
+    as_action,
+    resume_memory,
 )
-from baselines.compensation.policy import Action, Step, as_action, resume_memory
 from baselines.compensation.policy_around import as_batch_policy
 from baselines.residual.settings import ResidualSettings
 from elastic_env.core.errors import ConfigurationError, unknown_name

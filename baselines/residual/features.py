@@ -9,7 +9,7 @@
 | `contact_error` | walker: measured ZMP [m] and load share [1] as on level ground, less the planned ones |
 | `zmp_error` | walker: measured ZMP of flat feet less the planned one [m], with the effect of the ground's tilt |
 | `zmp_of_steps` | walker: mean `zmp_error` in the last step on either foot |
-| `level` | walker: attitude and foot wrenches as on level ground (`baselines.estimation.ground_level`) |
+| `level` | walker: attitude and foot wrenches as on level ground (`baselines.estimation.level_ground`) |
 | `bending` | walker: relative error of the model's bending, and the load (`baselines.estimation.model_error`) |
 | `phase` | walker: the first eight harmonics of the phase of a step [1] |
 | `standing`, `zmp_offset`, `feet`, `landing`, `shear` | estimates of the robot by a base such as `foothold`, from its memory |
@@ -25,7 +25,7 @@ import numpy as np
 
 from baselines.compensation.memory_rows import put_rows, select_rows
 from baselines.compensation.policy import ObservationView
-from baselines.estimation.ground_level import GroundLevel, GroundMemory
+from baselines.estimation.level_ground import GroundMemory, LevelGround
 from baselines.estimation.model_error import BendingObserver
 from baselines.residual.correction import Corrected
 from baselines.residual.mirror import LeftFirst
@@ -198,7 +198,7 @@ def _source(name: str, corrected: Corrected, period_s: float) -> Any:
     if isinstance(model, WalkerModel):
         walker_sources: dict[str, Callable[[], Any]] = {
             "contact_error": lambda: _ContactError(model, period_s),
-            "level": lambda: GroundLevel(model, period_s),
+            "level": lambda: LevelGround(model, period_s),
             "bending": lambda: BendingObserver(model),
             "phase": lambda: _phase(model),
             "zmp_error": lambda: _zmp_error(model),
@@ -328,7 +328,7 @@ class _ContactError:
     _LEAST_N = 50.0
 
     def __init__(self, model: WalkerModel, period_s: float) -> None:
-        self._level = GroundLevel(model, period_s)
+        self._level = LevelGround(model, period_s)
         self._share = model.observation_table.group("load_share")
         self._feet = FlatFeet(model, self._LEAST_N)
 

@@ -8,9 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from typing_extensions import override
 
-from baselines.compensation.inputs import PolicyInputs
 from baselines.compensation.memory_rows import put_rows, select_rows
-from baselines.compensation.policy import BatchPolicy, Step
+from baselines.compensation.policy import BatchPolicy, PolicyInputs, Step
 from baselines.residual.correction import Corrected, CorrectedMemory
 from baselines.residual.features import Features, FeaturesMemory
 from baselines.residual.network import Network

@@ -30,11 +30,10 @@ from typing import Any
 import numpy as np
 from typing_extensions import override
 
-from baselines.compensation.compiled_rows import Records, WalkView, record_row, record_rows
+from baselines.compensation.compiled_rows import Records, record_row, record_rows
 from baselines.compensation.contact_torque import cosine_and_sine, planned_feet, shifted_shares
 from baselines.compensation.filters import filter_share, within
-from baselines.compensation.inputs import PolicyInputs
-from baselines.compensation.policy import BatchPolicy, Step
+from baselines.compensation.policy import BatchPolicy, PolicyInputs, Step, WalkView
 from baselines.compensation.ramp import feedback_ramp
 from baselines.walking.zmp_shift import (
     Stances,

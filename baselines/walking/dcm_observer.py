@@ -29,10 +29,9 @@ from typing import Any
 import numpy as np
 from typing_extensions import override
 
-from baselines.compensation.compiled_rows import WalkView, record_row, record_rows
+from baselines.compensation.compiled_rows import record_row, record_rows
 from baselines.compensation.filters import filter_share
-from baselines.compensation.inputs import PolicyInputs
-from baselines.compensation.policy import Step
+from baselines.compensation.policy import PolicyInputs, Step, WalkView
 from baselines.compensation.policy_around import MemoryAround, PolicyAround
 from baselines.compensation.ramp import feedback_ramp
 from baselines.walking.flat_feet import LEAST_LOAD, FlatFeet

@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from baselines.compensation.compiled_rows import WalkView, record_row, record_rows
+from baselines.compensation.compiled_rows import record_row, record_rows
+from baselines.compensation.policy import WalkView
 from elastic_env.core.compiled import compiled
 from elastic_env.core.signals import Array
 from elastic_env.world.foot_sensors import FootSensors

@@ -12,9 +12,8 @@ from typing import Any
 import numpy as np
 from typing_extensions import override
 
-from baselines.compensation.compiled_rows import WalkView, record_row
-from baselines.compensation.inputs import PolicyInputs
-from baselines.compensation.policy import Step
+from baselines.compensation.compiled_rows import record_row
+from baselines.compensation.policy import PolicyInputs, Step, WalkView
 from baselines.compensation.policy_around import MemoryAround, PolicyAround
 from elastic_env.core.compiled import compiled, record_type
 from elastic_env.core.config import Model, quantity

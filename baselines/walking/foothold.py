@@ -28,9 +28,8 @@ from typing import Any
 import numpy as np
 from typing_extensions import override
 
-from baselines.compensation.compiled_rows import WalkView, record_row, record_rows
-from baselines.compensation.inputs import PolicyInputs
-from baselines.compensation.policy import Step
+from baselines.compensation.compiled_rows import record_row, record_rows
+from baselines.compensation.policy import PolicyInputs, Step, WalkView
 from baselines.compensation.policy_around import MemoryAround, PolicyAround
 from baselines.walking.zmp_offset import IN_PLANE
 from baselines.walking.zmp_shift import Stances, move_feet

@@ -20,8 +20,7 @@ import numpy as np
 from pydantic import Field
 from typing_extensions import override
 
-from baselines.compensation.inputs import PolicyInputs
-from baselines.compensation.policy import Step
+from baselines.compensation.policy import PolicyInputs, Step
 from baselines.compensation.policy_around import PassingMemory
 from elastic_env.core.config import Model, Title, load_json, quantity
 from elastic_env.core.errors import ConfigurationError

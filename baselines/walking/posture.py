@@ -27,10 +27,9 @@ from typing import Any
 import numpy as np
 from typing_extensions import override
 
-from baselines.compensation.compiled_rows import WalkView, record_row
+from baselines.compensation.compiled_rows import record_row
 from baselines.compensation.filters import filter_share, within
-from baselines.compensation.inputs import PolicyInputs
-from baselines.compensation.policy import Step
+from baselines.compensation.policy import PolicyInputs, Step, WalkView
 from baselines.compensation.policy_around import MemoryAround, PolicyAround
 from baselines.compensation.ramp import Ramp
 from elastic_env.core.compiled import compiled, compiled_part, record_type

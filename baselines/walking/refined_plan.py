@@ -20,8 +20,7 @@ from typing import Any
 import numpy as np
 from typing_extensions import override
 
-from baselines.compensation.inputs import PolicyInputs
-from baselines.compensation.policy import Step
+from baselines.compensation.policy import PolicyInputs, Step
 from baselines.compensation.policy_around import PassingMemory
 from elastic_env.core.signals import Array
 from elastic_env.motion.walk_plan import refine_plan

@@ -24,9 +24,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from typing_extensions import override
 
-from baselines.compensation.inputs import PolicyInputs
 from baselines.compensation.measured import TORQUE_SENSOR, require_sensor
-from baselines.compensation.policy import Step
+from baselines.compensation.policy import PolicyInputs, Step
 from baselines.compensation.policy_around import PolicyAround
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array

@@ -54,8 +54,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from typing_extensions import override
 
-from baselines.compensation.inputs import PolicyInputs
-from baselines.compensation.policy import BatchPolicy, Step
+from baselines.compensation.policy import BatchPolicy, PolicyInputs, Step
 from baselines.compensation.policy_around import PassingMemory
 from baselines.compensation.ramp import Ramp
 from baselines.walking.zmp_shift import within_reach

@@ -16,8 +16,7 @@ from typing import Any
 import numpy as np
 from typing_extensions import override
 
-from baselines.compensation.inputs import PolicyInputs
-from baselines.compensation.policy import Step
+from baselines.compensation.policy import PolicyInputs, Step
 from baselines.compensation.policy_around import MemoryAround, PolicyAround
 from baselines.walking.flat_feet import LEAST_LOAD, FlatFeet
 from elastic_env.core.compiled import compiled

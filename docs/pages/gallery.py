@@ -26,12 +26,12 @@ from elastic_env.rendering.picture import Image  # noqa: E402
 from elastic_env.rendering.sag import SagViews  # noqa: E402
 from elastic_env.rendering.simple_bodies import add_simple_bodies  # noqa: E402
 from elastic_env.rigid.rigid_body import RigidBody  # noqa: E402
+from elastic_env.robots.assumed_joints import random_poses  # noqa: E402
 from elastic_env.robots.gallery import (  # noqa: E402
     GALLERY,
     gallery_joints,
     gallery_robot,
     home_pose,
-    random_poses,
 )
 
 _SOFT = 0.7

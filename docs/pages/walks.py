@@ -13,7 +13,7 @@ from docs.pages.cells import (
 )
 from elastic_env.robots.thormang.walk_signals import BLOCKS
 from train.evaluate.leaderboard_rows import Standing
-from train.evaluate.margins import margin_table
+from train.evaluate.margin_search import margin_table
 
 PELVIS = "pelvis_error_rms_rad"
 ZMP = "zmp_deviation_rms_m"

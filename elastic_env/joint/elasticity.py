@@ -16,7 +16,6 @@ import numpy as np
 from elastic_env.core.compiled import within_compiled
 from elastic_env.core.errors import ElasticError
 from elastic_env.core.signals import Array, BoolArray, Parameter
-from elastic_env.joint.elastic_joint import ElasticJoint, FrictionTerms, Servo  # noqa: F401  TEMPORARY
 from elastic_env.joint.load_continuation import TorqueFunction, follow_load
 
 _SINGULAR = float(np.finfo(np.float64).eps)

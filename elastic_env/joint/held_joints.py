@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 from mujoco import MjModel, MjsBody, MjSpec
 
-from elastic_env.core.rotations import matrix_of, quaternion_of
+from elastic_env.core.quaternions import matrix_of, quaternion_of
 from elastic_env.core.signals import Array
 from elastic_env.joint.compile_model import compile_spec
 from elastic_env.joint.model_joints import home_of

@@ -29,9 +29,9 @@ from elastic_env.joint.joint_drive import BLANK, ActuatorRule, drive_joint
 from elastic_env.joint.joint_names import motor_name, part_names, spring_name
 from elastic_env.joint.keyframes import carry_keyframes
 from elastic_env.joint.model_file import read_model
+from elastic_env.joint.mujoco_friction import add_terms, varies
 from elastic_env.joint.supported_models import require_few, require_flags, require_hinge
 from elastic_env.joint.time_step import is_stable, largest_stable_timestep, round_below
-from elastic_env.joint.varying_friction import add_terms, varies
 
 Form = Literal["tendon", "rigid"]
 

@@ -9,7 +9,7 @@ import numpy as np
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array, IntArray
 from elastic_env.joint.joint_names import spring_name
-from elastic_env.joint.varying_friction import VaryingFriction
+from elastic_env.joint.mujoco_friction import VaryingFriction
 from elastic_env.world.robot_model import RobotModel
 from elastic_env.world.robot_ranges import DrawnRobot
 from elastic_env.world.scenario import Scenario

@@ -16,7 +16,7 @@ from elastic_env.core.json_text import LARGEST_JSON, parse_json
 from elastic_env.core.signals import NO_SIGNALS, Array, Parameter, SignalTable
 from elastic_env.joint.elastic_joint import ElasticJoint, Servo
 from elastic_env.joint.friction import passed_torque
-from elastic_env.joint.varying_friction import varies
+from elastic_env.joint.mujoco_friction import varies
 from elastic_env.motion.walk_plan import WalkPlan
 from elastic_env.rigid.biped import Biped
 

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from elastic_env.core.compiled import compiled, compiled_part
-from elastic_env.core.signals import Array, BoolArray, Parameter
+from elastic_env.core.signals import Array, BoolArray
 from elastic_env.world.attitude_kernels import (
     attitude_from_vertical,
     complementary_filter,
@@ -26,6 +26,7 @@ from elastic_env.world.joint_kernels import (
     sense_joints,
     step_at,
 )
+from elastic_env.world.walk_reward import score_walk
 
 FIRST_HALF = 1
 SECOND_HALF = 2
@@ -180,38 +181,6 @@ def end_walk(row: Any, rules: Any, diverged: bool, is_last: bool, ends: BoolArra
     ends[2] = is_terminated
     ends[3] = is_last and not is_terminated
     return is_terminated or is_last
-
-
-@compiled_part
-def score_walk(row: Any, planned: Any, weights: Any, is_failed: bool, terms: Any) -> float:
-    """Fill the weighted terms of the reward, and return their sum."""
-    x = row.zmp[0] - planned.zmp[0]
-    y = row.zmp[1] - planned.zmp[1]
-    drift_x = row.drift[0]
-    drift_y = row.drift[1]
-    in_feet = math.hypot(x - drift_x, y - drift_y)
-    terms.tilt = weights.tilt * planned.weight * tilt_penalty(row.tilt)
-    terms.zmp = weights.zmp * planned.weight * distance_penalty(math.hypot(x, y))
-    terms.effort = weights.effort * -row.servo_torque
-    terms.smoothness = weights.smoothness * -row.command_rate
-    terms.fall = weights.fall * (-1.0 if is_failed else 0.0)
-    terms.zmp_in_feet = weights.zmp_in_feet * planned.weight * distance_penalty(in_feet)
-    drift = math.hypot(drift_x, drift_y)
-    terms.foot_drift = weights.foot_drift * planned.weight * distance_penalty(drift)
-    total = terms.tilt + terms.zmp + terms.effort + terms.smoothness + terms.fall
-    return total + (terms.zmp_in_feet + terms.foot_drift)
-
-
-@compiled_part
-def tilt_penalty(tilt: Parameter) -> Any:
-    """−|tilt| [rad]: linear, so that the penalty never saturates."""
-    return -np.abs(tilt)
-
-
-@compiled_part
-def distance_penalty(distance: Parameter) -> Any:
-    """−distance [m]; −0 where it is nan because the feet are not loaded."""
-    return -np.fmax(distance, 0.0)
 
 
 # state of pelvis and feet

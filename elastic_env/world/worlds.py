@@ -11,7 +11,7 @@ from typing_extensions import override
 
 from elastic_env.core.compiled import compile_now
 from elastic_env.core.signals import Array, BoolArray, IntArray
-from elastic_env.joint.varying_friction import VaryingFriction
+from elastic_env.joint.mujoco_friction import VaryingFriction
 from elastic_env.world.physics import Simulation
 
 _BAD_NUMBERS = [

@@ -14,7 +14,13 @@ from elastic_env.core.files import write_whole
 from train.commands.comparison import try_out
 from train.commands.options import MotionOrDefault
 from train.evaluate.conditions import Condition, PolicySpec
-from train.evaluate.margins import QUANTITIES, Causes, failure_causes, find_margins, margin_table
+from train.evaluate.margin_search import (
+    QUANTITIES,
+    Causes,
+    failure_causes,
+    find_margins,
+    margin_table,
+)
 from train.evaluate.rollout import num_steps
 from train.runs.console import make_table, print_files
 from train.runs.escaping import write_records

@@ -17,7 +17,7 @@ from baselines import PositionCompensator
 from baselines.compensation.dry_friction import PRESLIDING_RAD, FrictionCompensation
 from baselines.compensation.position_compensator import CompensatorConstants
 from elastic_env.core.errors import ElasticError
-from elastic_env.core.rotations import matrix_of
+from elastic_env.core.quaternions import matrix_of
 from elastic_env.core.signals import Array
 from elastic_env.joint.model_joints import describe_home, held_positions
 from train.export import c_text

@@ -4,7 +4,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from baselines.compensation.inputs import NO_INPUTS
+from baselines.compensation.policy import NO_INPUTS
 from elastic_env.core.signals import Array, IntArray
 from elastic_env.world.robot_model import WalkerModel
 from train.export.walker_layers import WalkerLayers, find_layers

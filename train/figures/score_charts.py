@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from train.evaluate.environments import Column
-from train.evaluate.progress import Curves
+from train.evaluate.learning_curves import Curves
 from train.evaluate.statistics import Estimate
 from train.figures.chart import Cells, Chart, Colours, Curve, Evaluations, Panel
 from train.figures.colours import REFERENCE, dash_of

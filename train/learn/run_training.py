@@ -14,7 +14,7 @@ from rich.table import Table
 
 from train.evaluate.environments import environment
 from train.evaluate.episodes import Progress
-from train.evaluate.progress import read_progress
+from train.evaluate.learning_curves import read_progress
 from train.evaluate.rollout import single_world_envs
 from train.learn.algorithm_options import CONSTANTS
 from train.learn.train_config import TrainConfig

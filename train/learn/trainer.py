@@ -20,7 +20,7 @@ from elastic_env.core.files import read_bounded, write_whole
 from elastic_env.core.signals import Array, IntArray
 from train.evaluate.environments import environment
 from train.evaluate.episodes import evaluate_together, group_by
-from train.evaluate.progress import MOST_BYTES, PROGRESS
+from train.evaluate.learning_curves import MOST_BYTES, PROGRESS
 from train.evaluate.rollout import shared_settings
 from train.learn import checkpoint as checkpoints
 from train.learn.train_config import TrainConfig

@@ -16,8 +16,8 @@ from train.evaluate.changes import Change, Verdict
 from train.evaluate.environments import Column, Environment
 from train.evaluate.episodes import Evaluation, group_by
 from train.evaluate.leaderboard_rows import Standing
+from train.evaluate.learning_curves import Curves, learning_curves
 from train.evaluate.maps import HeatMap
-from train.evaluate.progress import Curves, learning_curves
 from train.evaluate.residual_seeds import Origin
 from train.evaluate.robots import RobotScores
 from train.evaluate.scores import Scores, best_of, failures, ranking

@@ -10,7 +10,7 @@ from train.evaluate.change_text import percent_interval
 from train.evaluate.changes import count_episodes_apart
 from train.evaluate.environments import Column
 from train.evaluate.episodes import group_by
-from train.evaluate.progress import Curves
+from train.evaluate.learning_curves import Curves
 from train.evaluate.robots import RobotScores
 from train.evaluate.scores import episodes_as_robots, score
 from train.evaluate.statistics import Estimate

@@ -9,7 +9,7 @@ from mujoco import MjModel
 
 from elastic_env.core.compiled import compile_now
 from elastic_env.core.errors import ConfigurationError, require_known
-from elastic_env.core.rotations import matrix_of
+from elastic_env.core.quaternions import matrix_of
 from elastic_env.core.signals import Array
 from elastic_env.rigid.tree import kernels
 from elastic_env.rigid.tree.links import Held, Tree

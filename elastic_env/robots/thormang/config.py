@@ -11,8 +11,8 @@ from elastic_env.core.errors import ConfigurationError, ElasticError
 from elastic_env.core.signals import Array
 from elastic_env.joint.elastic_joint import ElasticJoint
 from elastic_env.joint.joint_names import JointAddresses
+from elastic_env.joint.mujoco_friction import varies
 from elastic_env.joint.time_step import require_stable
-from elastic_env.joint.varying_friction import varies
 from elastic_env.motion.gait import Gait
 from elastic_env.motion.walk_plan import plan_walk
 from elastic_env.robots.thormang import model as thormang

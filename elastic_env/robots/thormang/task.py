@@ -1,7 +1,7 @@
 """The walking task: walk on elastic legs, in place or from foothold to foothold.
 
 The goal is a level pelvis, and ZMP and feet at their planned places. `score_walk` in
-`world.walk_kernels` is the reward, `WalkRewardWeights` has its weights.
+`world.walk_reward` is the reward, `WalkRewardWeights` has its weights.
 
 Observation of one world (float64); joints are l_hip_yaw, l_hip_roll, l_hip_pitch, l_knee,
 l_ankle_pitch, l_ankle_roll, then the same of the right leg (r_...); a name before a dot has one

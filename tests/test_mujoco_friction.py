@@ -12,13 +12,14 @@ import pytest
 
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
-from elastic_env.joint.elasticity import ElasticJoint, Servo, joint_torque
+from elastic_env.joint.elastic_joint import ElasticJoint, Servo
+from elastic_env.joint.elasticity import joint_torque
 from elastic_env.joint.friction import dry_friction, passed_torque
 from elastic_env.joint.joint_names import JointAddresses, motor_name, servo_name
 from elastic_env.joint.make_elastic import Form, make_elastic, transform_hinges
 from elastic_env.joint.model_servo import position_servo
 from elastic_env.joint.motor import Motor, terminal_speed
-from elastic_env.joint.varying_friction import VaryingFriction
+from elastic_env.joint.mujoco_friction import VaryingFriction
 from elastic_env.world.drawn_robot import set_joints
 from elastic_env.world.many_worlds import ManyWorlds, simulate
 from elastic_env.world.robot_ranges import RobotRanges, draw_robot

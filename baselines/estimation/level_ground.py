@@ -56,7 +56,7 @@ class GroundMemory(NamedTuple):
     velocity: Array
 
 
-class GroundLevel:
+class LevelGround:
     """Attitude and foot wrenches without the tilt of the ground, from the observations of a walker.
 
     Args:

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 import baselines
 import elastic_env  # noqa: F401  registers the environments
-from baselines.estimation.ground_level import TILT_RAD, VELOCITY_M_PER_S, GroundLevel, GroundMemory
+from baselines.estimation.level_ground import TILT_RAD, VELOCITY_M_PER_S, GroundMemory, LevelGround
 from baselines.estimation.model_error import BendingObserver
 from elastic_env.core.signals import Array
 from tests.ground_contact import zero_moment_point
@@ -35,7 +35,7 @@ def force(wrenches: Array) -> Array:
     return wrenches[:, :3] + wrenches[:, 6:9]
 
 
-def after_a_minute(ground: GroundLevel, rows: Array) -> tuple[Array, GroundMemory]:
+def after_a_minute(ground: LevelGround, rows: Array) -> tuple[Array, GroundMemory]:
     """Values and memory for a robot that stands still."""
     values, memory = ground.observe(rows, ground.begin(len(rows)))
     for _ in range(600):
@@ -54,7 +54,7 @@ def test_tilted_ground_shows_what_level_ground_would(tilt: tuple[float, float]) 
     """A robot that leans by itself, on ground that does: SciPy turns its weight about the center
     of mass."""
     model = walker("ideal").unwrapped.assumed_model
-    ground = GroundLevel(model, PERIOD_S)
+    ground = LevelGround(model, PERIOD_S)
     generator = np.random.default_rng(0)
     table = model.observation_table
     own = np.array([0.01, -0.02])
@@ -93,7 +93,7 @@ def test_slope_of_the_simulation_is_taken_off() -> None:
     for scenario in ("ideal", "ideal+slope"):
         env = walker(scenario, num_envs=2)
         model = env.unwrapped.assumed_model
-        ground = GroundLevel(model, PERIOD_S)
+        ground = LevelGround(model, PERIOD_S)
         table = model.observation_table
         rows = env.reset(seed=5)[0]
         values, memory = after_a_minute(ground, rows)
@@ -132,7 +132,7 @@ def test_the_mean_forgets_and_waits_for_feet_that_are_loaded() -> None:
     """The mean of the measurements, then a time constant; nothing while both feet hang, or from
     the first velocity."""
     model = walker("ideal").unwrapped.assumed_model
-    ground = GroundLevel(model, PERIOD_S, mean_s=1.0)
+    ground = LevelGround(model, PERIOD_S, mean_s=1.0)
     wrench = model.observation_table.group("wrench")
 
     def mean(x: float, z: float, memory: GroundMemory) -> GroundMemory:
@@ -160,7 +160,7 @@ def test_acceleration_and_certainty_have_their_closed_forms() -> None:
     """Catches a sign, a factor or an axis of the acceleration, and a first estimate that is
     believed at once."""
     model = walker("ideal").unwrapped.assumed_model
-    ground = GroundLevel(model, PERIOD_S)
+    ground = LevelGround(model, PERIOD_S)
     table = model.observation_table
     chains = model.biped.chains_above_feet
     rates = np.zeros((2, 6))
@@ -198,7 +198,7 @@ def test_what_accelerates_is_no_slope() -> None:
     env = walker("ideal", num_envs=1)
     model = env.unwrapped.assumed_model
     base = baselines.make("input_output", env)
-    ground = GroundLevel(model, 25 * model.control_period_s)
+    ground = LevelGround(model, 25 * model.control_period_s)
     observation, _ = env.reset(seed=5)
     state = None
     memory = ground.begin(1)
