@@ -28,6 +28,7 @@ from elastic_env.joint.urdf import keep_shapes, urdf_spec
 from elastic_env.rendering.simple_bodies import add_simple_bodies
 from elastic_env.rigid.rigid_body import RigidBody
 from elastic_env.robots import gallery
+from elastic_env.robots.assumed_joints import random_poses
 from elastic_env.robots.gallery import (
     GALLERY,
     gallery_file,
@@ -182,7 +183,7 @@ def test_everybody_computes_the_same_gravity_torque(name: str) -> None:
     model = rigid(name)
     hinges = hinges_of(model)
     data = mujoco.MjData(model)
-    poses = gallery.random_poses(model, np.random.default_rng(3), 10)
+    poses = random_poses(model, np.random.default_rng(3), 10)
     ours = RigidBody(model, hinges).gravity_torque(poses)
     size = np.abs(ours).max()
     for pose, torque in zip(poses, ours, strict=True):
@@ -237,7 +238,7 @@ def test_the_figures_of_the_page_are_those_of_robots_at_rest(name: str) -> None:
     model = elastic(name)
     rotors, links = sides(model, robot.hinges)
     data = mujoco.MjData(model)
-    q_ref = gallery.random_poses(robot.model, np.random.default_rng(5), 3)
+    q_ref = random_poses(robot.model, np.random.default_rng(5), 3)
     model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_FRICTIONLOSS)
     for theta in (q_ref, robot.commands(q_ref)):
         for motor, link in zip(theta, robot.links(theta), strict=True):
