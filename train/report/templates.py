@@ -1,5 +1,6 @@
 """Templates of Jinja2: the page of a report as HTML, and its sentences as plain text."""
 
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -16,17 +17,22 @@ def load_template(name: str = "page.html.j2") -> Any:
         MissingExtraError: Jinja2 is not installed.
     """
     try:
-        from jinja2 import Environment, FileSystemLoader, StrictUndefined
+        import jinja2
     except ImportError:
         raise missing_extra("jinja2", "report", "writing a report") from None
-    is_html = name.endswith(".html.j2")
-    environment = Environment(
-        loader=FileSystemLoader(Path(__file__).parent),
+    return _environment(jinja2, name.endswith(".html.j2")).get_template(name)
+
+
+@cache
+def _environment(jinja2: Any, is_html: bool) -> Any:
+    """Make Jinja's environment of HTML or of text, which keeps its compiled templates."""
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(Path(__file__).parent),
         autoescape=is_html,
-        undefined=StrictUndefined,
+        undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         finalize=template_value if is_html else line_value,
     )
     environment.filters.update(script_json=script_json)
     environment.globals.update(font=FONT, night=NIGHT, verdicts=VERDICTS)
-    return environment.get_template(name)
+    return environment
