@@ -17,19 +17,21 @@ def load_template(name: str = "page.html.j2") -> Any:
         MissingExtraError: Jinja2 is not installed.
     """
     try:
-        import jinja2
+        import jinja2  # noqa: F401
     except ImportError:
         raise missing_extra("jinja2", "report", "writing a report") from None
-    return _environment(jinja2, name.endswith(".html.j2")).get_template(name)
+    return _environment(name.endswith(".html.j2")).get_template(name)
 
 
 @cache
-def _environment(jinja2: Any, is_html: bool) -> Any:
+def _environment(is_html: bool) -> Any:
     """Make Jinja's environment of HTML or of text, which keeps its compiled templates."""
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(Path(__file__).parent),
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+    environment = Environment(
+        loader=FileSystemLoader(Path(__file__).parent),
         autoescape=is_html,
-        undefined=jinja2.StrictUndefined,
+        undefined=StrictUndefined,
         trim_blocks=True,
         finalize=template_value if is_html else line_value,
     )
