@@ -166,6 +166,17 @@ def test_where_nothing_can_be_kept_it_works_all_the_same(monkeypatch: pytest.Mon
     assert compiled(lambda value: 2.0 * value)(1.5) == 3.0
 
 
+def test_without_source_files_kernels_compile_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches an installation of compiled Python alone that cannot be imported."""
+
+    def missing(_: object) -> str:
+        raise OSError("could not get source code")
+
+    monkeypatch.setattr(module.inspect, "getsource", missing)
+    rms_of_rows = compiled(walk_kernels.rms_of_rows.py_func)  # its file imports kernels
+    assert rms_of_rows(np.full((1, 3), -2.0)) == [2.0]
+
+
 def test_a_full_disk_costs_time_and_nothing_else() -> None:
     """Catches an environment that fails because what was compiled cannot be kept."""
     calls = []

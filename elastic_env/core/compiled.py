@@ -73,7 +73,10 @@ def _digest_of_imports(function: Callable[..., Any]) -> str:
     modules = sorted(_imported_modules(function))
     if not modules:
         return ""
-    sources = [inspect.getsource(sys.modules[name]) for name in modules]
+    try:
+        sources = [inspect.getsource(sys.modules[name]) for name in modules]
+    except OSError:  # without source files Numba keeps no code either
+        return ""
     return "-" + hashlib.sha256("".join(sources).encode()).hexdigest()[:16]
 
 
