@@ -5,12 +5,12 @@ desired angle. An output compensator estimates the link angle for a motor encode
 (..., n) arrays.
 """
 
-from abc import abstractmethod
-from typing import Any, Literal, NamedTuple, Protocol, TypeVar, get_args
+from typing import Any, Literal, NamedTuple, TypeVar, get_args
 
 import numpy as np
 from typing_extensions import override
 
+from baselines.compensation.compensator import Compensator
 from baselines.compensation.contact_torque import WrenchTorque, planned_feet, shift_plan
 from baselines.compensation.gravity_torque import GravityMethod, GravityModel, make_gravity
 from baselines.compensation.inputs import DEFLECTION
@@ -80,45 +80,6 @@ def newton_link_angle(theta: Array, stiffness: Array, gravity: GravityModel) -> 
     torque = gravity.gravity_torque
     gradient = gravity.gravity_gradient
     return elasticity.static_link_angle(theta, stiffness, torque, gradient)
-
-
-class Compensator(Protocol):
-    """An input offset for a motion, and a link angle for an encoder angle, for `Compensated`.
-
-    `memory` has one row per world: an array, or a named tuple of arrays.
-    """
-
-    model: RobotModel
-    modelled: float | Array = 1.0
-    """1 where its link angles follow from the model, 0 where sensors measure them; a number, or
-    (n,) [1].
-    """
-    weighs: bool = False
-    """True where its link angles show a load that the model does not have."""
-
-    @abstractmethod
-    def at(self, rows: Array) -> "Compensator":
-        """Compensator for the loads at the control steps of observations, (num_worlds, m)."""
-
-    @abstractmethod
-    def begin(self, motion: Motion) -> Any:
-        """Memory at rest at the start of an episode."""
-
-    @abstractmethod
-    def offset(self, motion: Motion, memory: Any) -> tuple[Array, Any]:
-        """Command offset for the coming control period, (num_worlds, n) [rad], and new memory."""
-
-    @abstractmethod
-    def deflection(self, offset: Array, memory: Any) -> Array:
-        """Deflection δ within an offset that `offset` returned, (num_worlds, n) [rad]."""
-
-    @abstractmethod
-    def link_angle(self, theta: Array, memory: Any) -> Array:
-        """Estimate of q from the encoders, (num_worlds, n) [rad]."""
-
-    @abstractmethod
-    def link_rate(self, theta: Array, theta_dot: Array) -> Array:
-        """Estimate of q̇ from the encoders, (num_worlds, n) [rad/s]."""
 
 
 class GravityCompensator(Compensator):

@@ -6,12 +6,8 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from typing_extensions import override
 
-from baselines.compensation.compensators import (
-    Compensator,
-    GravityCompensator,
-    OutputMethod,
-    shallow_copy,
-)
+from baselines.compensation.compensator import Compensator
+from baselines.compensation.compensators import GravityCompensator, OutputMethod, shallow_copy
 from baselines.compensation.compiled_rows import record_rows
 from baselines.compensation.contact_torque import PlannedTorque
 from baselines.compensation.dry_friction import FrictionCompensation, FrictionMemory

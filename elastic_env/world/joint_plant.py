@@ -1,4 +1,4 @@
-"""The plant of a robot of elastic joints on a fixed base."""
+"""The plant of a robot of elastic joints on a fixed base, its truth, and its rest."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -6,10 +6,13 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from elastic_env.core.signals import Array, Parameter
+from elastic_env.core.signals import Array, BoolArray, Parameter
 from elastic_env.joint.elasticity import static_link_angle
 from elastic_env.motion.trajectory import Motion
 from elastic_env.rigid.tree.end_effector import EndEffector
+from elastic_env.world.further_sensors import SensorInputs
+from elastic_env.world.physics import Simulation
+from elastic_env.world.records import Records
 from elastic_env.world.robot_model import RobotModel
 
 _RIGID_NM_PER_RAD = 1e15
@@ -78,3 +81,57 @@ class JointPlant:
         return static_link_angle(
             engaged, finite, self.static_torque, self.torque_gradient, unique=False
         )
+
+
+@dataclass(frozen=True)
+class JointTruth(SensorInputs):
+    """Noise-free state of the joints and their true parameters, one row per world.
+
+    For scoring and the oracle.
+
+    Attributes:
+        theta, theta_dot, q_dot: Motor and link side, (num_worlds, n) [rad], [rad/s].
+        deflection: θ − q, (num_worlds, n) [rad].
+        stiffness: True K, (num_worlds, n) [N·m/rad].
+        model: The true joints and links.
+    """
+
+    theta: Array
+    theta_dot: Array
+    q_dot: Array
+    deflection: Array
+    stiffness: Array
+    model: RobotModel
+
+
+def place_at_rest(
+    plant: JointPlant,
+    simulation: Simulation,
+    addresses: Records,
+    worlds: BoolArray,
+    q_ref: Array,
+    truth: Records,
+) -> None:
+    """Put the springs of some worlds at their static deflection while the servos hold q_ref.
+
+    Args:
+        plant: The plant of all worlds.
+        simulation: Its physics, whose state is written.
+        addresses: Records of `ADDRESS`, (n,).
+        worlds: Mask of the k worlds.
+        q_ref: Reference, (k, n) [rad].
+        truth: True parameters of the joints in these worlds, (k, n).
+    """
+    command = q_ref - truth["homing"]
+    factor = truth["stiffness"] / plant.true.stiffness
+    q = plant.rest_angle(command, factor, truth["backlash"])
+    torque = plant.static_torque(q)
+    theta = command - plant.true.servo_compliance * torque
+    simulation.qpos[np.ix_(worlds, addresses["theta"])] = theta
+    simulation.qpos[np.ix_(worlds, addresses["q"])] = q
+    simulation.ctrl[np.ix_(worlds, addresses["servo"])] = command
+    for column, servo in enumerate(plant.true.servos):
+        if servo.integral_gain > 0.0:
+            integrator = plant.model.actuator_actadr[addresses["servo"][column]]
+            windup = torque[:, column] / servo.integral_gain
+            simulation.act[worlds, integrator] = windup

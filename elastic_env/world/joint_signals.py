@@ -2,8 +2,12 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
+import numpy as np
+import numpy.typing as npt
+
+from elastic_env.core.errors import ActionError
 from elastic_env.core.signals import Kind, Mirrored, SignalGroup, SignalTable
 
 Mirrors: TypeAlias = Mapping[str, Mirrored | None]
@@ -30,6 +34,31 @@ def action_table(joints: Sequence[str], bound_rad: float = ACTION_BOUND_RAD) -> 
     group = SignalGroup.of("command_offset", "rad", "θ_cmd − q_ref", parts, "command")
     bounds = {"low": -bound_rad, "high": bound_rad}
     return SignalTable(tuple(replace(signal, **bounds) for signal in group.signals))
+
+
+def action_error(
+    action: npt.NDArray[Any], shape: tuple[int, ...], bound_rad: float, is_scalar: bool
+) -> ActionError:
+    """Error that describes the fault of an action.
+
+    Args:
+        action: The action that was given.
+        shape: Shape that it must have, (num_worlds, n).
+        bound_rad: Largest offset [rad].
+        is_scalar: True for an environment of one world, which adds the axis of worlds itself.
+    """
+    bounds = f"within ±{bound_rad:g} rad"
+    if action.dtype.kind not in "fiub":
+        problem = f"be real numbers, {bounds}, got an array of {action.dtype}"
+    elif action.shape != shape:
+        first = int(is_scalar)
+        got = f"got shape {action.shape[first:]}"
+        problem = f"have shape {shape[first:]} [rad], {bounds}; {got}"
+    else:
+        world = np.flatnonzero(~np.isfinite(action).all(axis=1))[0]
+        got = f"got {action[world]} in world {world}"
+        problem = f"be finite, {bounds}, shape {shape[1:]} a world; {got}"
+    return ActionError(f"an action must {problem}")
 
 
 def joint_groups(joints: Mirrors) -> dict[str, SignalGroup]:

@@ -6,7 +6,6 @@ those of `elastic_env.world.link_signals`.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -18,9 +17,8 @@ from elastic_env.joint.time_step import require_stable
 from elastic_env.motion.trajectory import PlanTable
 from elastic_env.world import drawn_robot, records
 from elastic_env.world import joint_kernels as kernels
-from elastic_env.world.further_sensors import SensorInputs
 from elastic_env.world.joint_config import JointConfig
-from elastic_env.world.joint_plant import JointPlant
+from elastic_env.world.joint_plant import JointPlant, JointTruth, place_at_rest
 from elastic_env.world.joint_signals import joint_groups
 from elastic_env.world.link_signals import (
     LINK_IMU,
@@ -34,31 +32,9 @@ from elastic_env.world.pendulum_imu import make_pendulum_imu
 from elastic_env.world.physics import DIVERGED_RAD_S
 from elastic_env.world.records import Records, Sample, single_record
 from elastic_env.world.rest_watch import RestWatch
-from elastic_env.world.robot_model import RobotModel
 from elastic_env.world.robot_ranges import draw_robot, draw_robots
 from elastic_env.world.sensors import is_due
 from elastic_env.world.task import Task
-
-
-@dataclass(frozen=True)
-class JointTruth(SensorInputs):
-    """Noise-free state of the joints and their true parameters, one row per world.
-
-    For scoring and the oracle.
-
-    Attributes:
-        theta, theta_dot, q_dot: Motor and link side, (num_worlds, n) [rad], [rad/s].
-        deflection: θ − q, (num_worlds, n) [rad].
-        stiffness: True K, (num_worlds, n) [N·m/rad].
-        model: The true joints and links.
-    """
-
-    theta: Array
-    theta_dot: Array
-    q_dot: Array
-    deflection: Array
-    stiffness: Array
-    model: RobotModel
 
 
 class JointTask(Task):
@@ -186,7 +162,6 @@ class JointTask(Task):
         """Put the springs at their static deflection while the servos hold q_ref."""
         simulation = self.simulation
         addresses = self._addresses
-        model = self._true_model
         truth = self._joints[self._row]["truth"][worlds]
         if self._has_drawn_joints:
             for world in np.flatnonzero(worlds).tolist():
@@ -199,19 +174,7 @@ class JointTask(Task):
                 scenario = self.config.scenario
                 drawn_robot.set_joints(field, self.model, self._springs, links, robot, scenario)
         q_ref = self._reference.motion[self._reference.plan_of_world[worlds], 0, 0]
-        command = q_ref - truth["homing"]
-        factor = truth["stiffness"] / model.stiffness
-        q = self._plant.rest_angle(command, factor, truth["backlash"])
-        torque = self._plant.static_torque(q)
-        theta = command - model.servo_compliance * torque
-        simulation.qpos[np.ix_(worlds, addresses["theta"])] = theta
-        simulation.qpos[np.ix_(worlds, addresses["q"])] = q
-        simulation.ctrl[np.ix_(worlds, addresses["servo"])] = command
-        for column, servo in enumerate(model.servos):
-            if servo.integral_gain > 0.0:
-                integrator = self.model.actuator_actadr[addresses["servo"][column]]
-                windup = torque[:, column] / servo.integral_gain
-                simulation.act[worlds, integrator] = windup
+        place_at_rest(self._plant, simulation, addresses, worlds, q_ref, truth)
         if self._has_sensors:
             simulation.bind("sensordata")
             simulation.refresh(worlds)

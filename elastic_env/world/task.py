@@ -18,7 +18,6 @@ from gymnasium.error import ResetNeeded
 
 from elastic_env.core.compiled import compile_now
 from elastic_env.core.episode_random import EpisodeRandom
-from elastic_env.core.errors import ActionError
 from elastic_env.core.signals import Array, BoolArray, Signal, Signals, SignalTable
 from elastic_env.motion.trajectory import Motion, PlanTable
 from elastic_env.world import further_sensors as further
@@ -167,7 +166,7 @@ class Task(ABC):
         """
         own = simulation or simulate(self.model, self.num_worlds, num_threads)
         self.simulation = own
-        self._is_scalar = is_scalar
+        self._action_rules = (self._action_shape, self._bound.max(), is_scalar)
         self._metrics = EpisodeMetrics(self.metrics, self.num_worlds)
         # scoring many steps takes 2 ms, half a control period of hardware
         if simulation is not None:
@@ -347,12 +346,12 @@ class Task(ABC):
         """Command the servos; return the clipped offsets and the worlds with a clipped one."""
         values = np.asarray(action)
         if values.dtype.kind not in "fiub" or values.shape != self._action_shape:
-            raise self._action_error(values)
+            raise joint_signals.action_error(values, *self._action_rules)
         offset = values.astype(np.float64, order="C")
         is_clipped = np.empty(self.num_worlds, dtype=np.bool_)
         arrays = (offset, self._bound, is_clipped, self.simulation.ctrl)
         if not kernels.write_commands(self._step, *arrays, *kernels.EVERY_WORLD):
-            raise self._action_error(values.astype(np.float64))
+            raise joint_signals.action_error(values.astype(np.float64), *self._action_rules)
         return offset, is_clipped
 
     def _sense(self, offset: Array, is_clipped: BoolArray) -> tuple[Array, Array, BoolArray, bool]:
@@ -438,20 +437,3 @@ class Task(ABC):
         for reason, failed in reversed([*zip(self._failures, ends, strict=False)]):
             reasons[failed] = reason
         return reasons
-
-    def _action_error(self, action: npt.NDArray[Any]) -> ActionError:
-        """Error that describes the fault of an action."""
-        shape = self._action_shape
-        bounds = f"within ±{self._bound.max():g} rad"
-        if action.dtype.kind not in "fiub":
-            problem = f"be real numbers, {bounds}, got an array of {action.dtype}"
-        elif action.shape != shape:
-            # a scalar environment adds the axis of worlds itself
-            first = int(self._is_scalar)
-            got = f"got shape {action.shape[first:]}"
-            problem = f"have shape {shape[first:]} [rad], {bounds}; {got}"
-        else:
-            world = np.flatnonzero(~np.isfinite(action).all(axis=1))[0]
-            got = f"got {action[world]} in world {world}"
-            problem = f"be finite, {bounds}, shape {shape[1:]} a world; {got}"
-        return ActionError(f"an action must {problem}")

@@ -32,7 +32,8 @@ from elastic_env.robots.testbed.config import TestbedConfig
 from elastic_env.robots.testbed.environment import configure_testbed
 from elastic_env.robots.testbed.picture import TestbedPicture
 from elastic_env.world.env import ElasticEnv
-from elastic_env.world.joint_task import JointTask, JointTruth
+from elastic_env.world.joint_plant import JointTruth
+from elastic_env.world.joint_task import JointTask
 from elastic_env.world.link_signals import METRICS_OF_ONE
 from elastic_env.world.metrics import Metric
 from elastic_env.world.records import REAL, WHOLE, Records, record_type
