@@ -1,4 +1,4 @@
-"""What a compensator is: offsets of commands, and estimates of link angles."""
+"""Protocol of a compensator: offsets of commands, and estimates of link angles."""
 
 from abc import abstractmethod
 from typing import Any, Protocol
