@@ -94,7 +94,7 @@ def test_a_kernel_uses_only_kernels_and_types_of_other_files(name: str) -> None:
 
 
 CHAIN = {
-    "chain_first": "FACTOR = 2.0\n\n@{kind}\ndef first(value):\n    return {factor} * value\n",
+    "chain_first": "@{kind}\ndef first(value):\n    return {factor} * value\n",
     "chain_second": "from chain_first import first\n\n@{kind}\ndef second(value):\n"
     "    return first(value) + 1.0\n",
     "chain_third": "from chain_second import second\n\n@compiled\ndef third(value):\n"
@@ -111,7 +111,7 @@ def test_a_kernel_compiles_anew_where_a_file_that_it_calls_has_changed(
     monkeypatch.setattr(sys, "dont_write_bytecode", True)  # files of one second look the same
     for factor in ("2.0", "3.0", "2.0"):
         for name, text in CHAIN.items():
-            monkeypatch.delitem(sys.modules, name, raising=False)
+            sys.modules.pop(name, None)
             decorators = f"from elastic_env.core.compiled import compiled, {kind} as {kind}\n"
             text = decorators + text.format(kind=kind, factor=factor)
             (tmp_path / f"{name}.py").write_text(text)
@@ -147,7 +147,18 @@ def test_the_package_calls_no_part_of_a_kernel_from_python() -> None:
         parts |= here
     for package in ("elastic_env", "baselines", "train"):
         for file in (ROOT / package).rglob("*.py"):
-            assert not set(re.findall(r"\bkernels\.(\w+)\(", file.read_text())) & parts, file
+            text = file.read_text()
+            assert not set(re.findall(r"kernels\.(\w+)\(", text)) & parts, file
+            tree = ast.parse(text)
+            imported = {
+                alias.name
+                for node in tree.body
+                if isinstance(node, ast.ImportFrom) and node.module in KERNELS
+                for alias in node.names
+            }
+            in_python = [node for node in tree.body if node not in decorated(tree)]
+            used = [n for part in in_python for n in ast.walk(part) if isinstance(n, ast.Name)]
+            assert not {node.id for node in used} & imported & parts, file
 
 
 def test_where_nothing_can_be_kept_it_works_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -36,7 +36,7 @@ _ALWAYS = "for some seconds in every program: there is no folder to keep it that
 _notes: dict[Any, str] = {}
 """How often a function is compiled, by its Python code."""
 _imports: dict[str, set[str]] = {}
-"""Modules with kernels, and those of them whose kernels they import."""
+"""Modules with kernels, and those of them whose kernels they import, also through others."""
 
 
 def compiled(function: Callable[_P, _R]) -> Callable[_P, _R]:

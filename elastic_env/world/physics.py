@@ -82,7 +82,6 @@ DIVERGED_RAD_S = 1e3
 servos.
 """
 
-
 MOST_SUBSTEPS = 1000
 """Largest number of physics steps in a control period."""
 

@@ -134,7 +134,13 @@ def first_columns(table: SignalTable, groups: Sequence[str]) -> Records:
 
 
 def joint_rules(period_s: float, kinds: Sequence[tuple[int | None, bool]]) -> Records:
-    """Records of `RULES`, one per kind of world."""
+    """Records of `RULES`, one per kind of world.
+
+    Args:
+        period_s: Control period [s].
+        kinds: Encoder counts per turn, None for continuous encoders, and True if measurements are
+            delayed.
+    """
     rules = np.zeros(len(kinds), RULES)
     rules["control_period_s"] = period_s
     rules["count_rad"] = [angle_of_count(counts) for counts, _ in kinds]
