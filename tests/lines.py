@@ -42,6 +42,9 @@ class Loop:
         self._coming = self._coming[length:]
         return data
 
+    def getBytesAvailable(self) -> int:  # noqa: N802
+        return len(self._coming)
+
     def clearPort(self) -> None:  # noqa: N802
         self._coming = b""
 

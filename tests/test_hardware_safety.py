@@ -263,6 +263,39 @@ def test_check_finds_nothing_wrong_with_the_newer_servos() -> None:
     assert set(found.values()) == {True}
 
 
+def test_a_reply_that_came_while_the_program_did_not_run_is_read(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Catches a good reply that counts as damaged: the computer let the program read one byte, and
+    then did not run it until the time was over."""
+    bus = VirtualBus(EmulatorConfig())
+    port = bus.driver.port
+    read = port.readPort
+    pauses = iter([0.1])
+
+    def read_late(length: int) -> bytes:
+        for pause_s in pauses:
+            bus.sleep(pause_s)
+            return read(1)
+        return read(length)
+
+    monkeypatch.setattr(port, "readPort", read_late)
+    assert bus.driver.ping(1).model_number == 54024
+    assert next(pauses, None) is None
+    assert bus.driver.num_retries == 0
+
+
+def test_servos_have_as_long_to_confirm_before_a_second_motion_as_before_the_first() -> None:
+    """Catches the short time that replies have in motion, and that stays when the motion ends."""
+    bus = VirtualBus(EmulatorConfig())
+    ranges = np.array([[-1.0, 1.0]])
+    for _ in range(2):
+        bus.emulator.set_faults({"late": 1.0, "late_s": 0.02})
+        bus.enable(PATIENT, ranges)
+        bus.emulator.set_faults({"late": 0.0})
+        bus.close()
+
+
 @pytest.mark.parametrize("fault", ["lost", "corrupted"])
 def test_a_bad_line_is_seen_by_its_lost_and_damaged_replies(fault: str) -> None:
     """Catches a check that calls a line fine whose replies come at the second try."""

@@ -14,7 +14,8 @@ from elastic_env.hardware.errors import ReplyError
 _TRIES = 3
 _QUIET_S = 0.03
 """Silence after which no late reply is expected [s]."""
-_REPLY_TIMEOUT_S = 0.05
+REPLY_TIMEOUT_S = 0.05
+"""Time that a reply at rest may take beyond that on the wire [s]."""
 _PING_S = 3e-3
 """Time that each possible servo has to answer a ping to all [s]."""
 
@@ -66,7 +67,7 @@ class PacketLine(ABC):
     def __init__(self, name: str, baudrate: int | None = None) -> None:
         self.name = name
         self.port = port.Port(name, baudrate or self.rates[0])
-        self.reply_timeout_s = _REPLY_TIMEOUT_S
+        self.reply_timeout_s = REPLY_TIMEOUT_S
         self.num_retries = 0
         self._parser = self.parser()
         self._received: deque[Packet] = deque()
@@ -140,16 +141,21 @@ class PacketLine(ABC):
             raise ReplyError(f"cannot send at {self.name}: {sent} of {len(wire)} bytes were taken")
 
     def _receive(self) -> Status | None:
-        """Wait for the next reply; None if none comes in time."""
+        """Wait for the next reply; None if none comes in time.
+
+        What has come while this process did not run is still read.
+        """
         with port.bus_gone(self.name):
             while not self._received:
-                if self.port.isPacketTimeout():
+                is_over = self.port.isPacketTimeout()
+                may_read = not is_over or self.port.getBytesAvailable()
+                data = self.port.readPort(4096) if may_read else b""
+                self._is_noise |= bool(data)
+                self._received.extend(self._parser.parse(data))
+                if is_over and not self._received:
                     was_noise = self._is_noise
                     self._is_noise = False
                     return DAMAGED if was_noise else None
-                data = self.port.readPort(4096)
-                self._is_noise |= bool(data)
-                self._received.extend(self._parser.parse(data))
         self._is_noise = False
         packet = self._received.popleft()
         return self._status(packet) if packet.is_intact else DAMAGED

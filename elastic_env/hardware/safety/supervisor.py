@@ -20,7 +20,7 @@ import numpy as np
 
 from elastic_env.hardware.buses.bus import States
 from elastic_env.hardware.buses.bus_group import BusGroup
-from elastic_env.hardware.buses.packet_line import servo_name
+from elastic_env.hardware.buses.packet_line import REPLY_TIMEOUT_S, servo_name
 from elastic_env.hardware.buses.protocols import BUSES
 from elastic_env.hardware.buses.servo_bus import ServoBus
 from elastic_env.hardware.buses.servo_models import Protocol
@@ -141,6 +141,8 @@ class Supervisor:
         if isinstance(self._fault, BusGoneError):
             # final: an adapter that is plugged in again is another port
             raise self._fault.with_traceback(None)
+        for bus in self._buses:
+            bus.reply_timeout_s = REPLY_TIMEOUT_S
         self._disable()
         safety_limits = SafetyLimits(**limits)
         servos = self._servos.servos
