@@ -285,6 +285,28 @@ def test_a_reply_that_came_while_the_program_did_not_run_is_read(
     assert bus.driver.num_retries == 0
 
 
+def test_a_second_answer_to_one_request_is_not_taken_for_the_next_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Catches a register with the value of another: a line that stood still passes on two tries of
+    a request, and the second answer comes when the next request is under way."""
+    bus = VirtualBus(EmulatorConfig())
+    port = bus.driver.port
+    names = ("min_voltage_limit", "max_voltage_limit")
+    expected = [bus.driver.read_register(1, name) for name in names]
+    write = port.writePort
+    delays = iter([0.09, 0.012])
+
+    def write_to_slow_line(wire: bytes) -> int:
+        bus.emulator.set_faults({"late": 1.0, "late_s": next(delays, 0.0)})
+        return write(wire)
+
+    monkeypatch.setattr(port, "writePort", write_to_slow_line)
+    assert [bus.driver.read_register(1, name) for name in names] == expected
+    assert bus.driver.num_retries == 1
+    assert expected[0] != expected[1]
+
+
 def test_servos_have_as_long_to_confirm_before_a_second_motion_as_before_the_first() -> None:
     """Catches the short time that replies have in motion, and that stays when the motion ends."""
     bus = VirtualBus(EmulatorConfig())

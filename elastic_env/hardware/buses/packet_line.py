@@ -167,13 +167,14 @@ class PacketLine(ABC):
     def _request(self, servo_id: int, kind: int, data: bytes, length: int) -> bytes:
         """Send an instruction to a servo and return the data of its reply.
 
-        There are a few tries, with silence in between, so that no late reply answers the next one.
+        There are a few tries. Silence after a failure, and after a retry, keeps a late reply from
+        answering the next request.
 
         Raises:
             ReplyError: No valid reply comes, or the servo refuses.
         """
         problem = "does not answer"
-        for _ in range(_TRIES):
+        for retry in range(_TRIES):
             self._transmit(servo_id, kind, data)
             wire_ms = self.port.tx_time_per_byte * (self.status_bytes + length)
             self.port.setPacketTimeoutMillis(wire_ms + 1e3 * self.reply_timeout_s)
@@ -190,6 +191,8 @@ class PacketLine(ABC):
                     problem = f"says that {reason}"
                     break
                 if len(reply.data) == length:
+                    if retry:  # both tries may be answered, the second one late
+                        self._wait_for_silence()
                     return reply.data
             self._wait_for_silence()
             self.num_retries += 1
