@@ -26,7 +26,7 @@ from baselines.residual.settings import ResidualSettings
 from baselines.residual.true_robot import CriticView, truth_of
 from elastic_env.core.errors import ActionError, ConfigurationError, quote
 from elastic_env.core.signals import Array, BoolArray
-from elastic_env.world.task import Transition
+from elastic_env.world.control_step import Transition
 from elastic_env.world.vector_env import final_of, reset_mask
 
 

@@ -78,7 +78,7 @@ BROKEN = (
         _ELASTICITY, "matrix = relative_gradient + np.eye(n)", "matrix = np.eye(n)", JOINT
     ),
     BrokenFormula(
-        _ELASTICITY,
+        "elastic_env/joint/static_equilibrium.py",
         "K * (q - theta) + torque(q)",
         "K * (q - theta) - torque(q)",
         f"{JOINT} {COMPENSATION}",

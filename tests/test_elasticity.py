@@ -14,12 +14,8 @@ from scipy import optimize
 from elastic_env.core.errors import ConfigurationError, ElasticError
 from elastic_env.core.signals import Array
 from elastic_env.joint.elastic_joint import ElasticJoint
-from elastic_env.joint.elasticity import (
-    joint_torque,
-    solve_stiffness,
-    static_deflection,
-    static_link_angle,
-)
+from elastic_env.joint.elasticity import joint_torque, solve_stiffness, static_deflection
+from elastic_env.joint.static_equilibrium import static_link_angle
 from elastic_env.robots.testbed.model import Pendulum
 
 PENDULUM = Pendulum()

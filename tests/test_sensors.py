@@ -115,6 +115,23 @@ def test_a_stream_depends_on_its_generator_and_its_use_alone() -> None:
             assert given[1] == alone.next(np.ones(1, dtype=bool))[0]
 
 
+def test_samples_that_were_prepared_for_many_steps_follow_one_another() -> None:
+    """Catches a refill that drops prepared samples, or draws them anew."""
+    stream = NoiseStream(2, ONE, block=7)
+    for world in range(2):
+        stream.restart(world, np.random.default_rng(20 + world))
+    taken: list[list[float]] = [[], []]
+    for steps in (7, 3, 1, 6, 2, 5, 7):
+        stream.prepare(steps)
+        for step in range(steps):
+            for world in range(1 + step % 2):  # the second world uses half of them
+                taken[world].append(stream.samples["a"][stream.used[world], world])
+                stream.used[world] += 1
+    for world, numbers in enumerate(taken):
+        expected = np.random.default_rng(20 + world).standard_normal(len(numbers))
+        np.testing.assert_array_equal(numbers, expected)
+
+
 def test_a_restarted_stream_begins_anew() -> None:
     """Catches samples of the episode before."""
     stream = NoiseStream(1, TWO, block=5)

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from elastic_env.world.step_info import StepInfo
+from elastic_env.world.control_step import StepInfo
 
 PLAIN = {"given": 1, "other": 2, "late": 3, "later": 4}
 

@@ -21,6 +21,7 @@ from baselines.compensation.ramp import Ramp
 from elastic_env.core.errors import ConfigurationError, require_known
 from elastic_env.core.signals import Array, IntArray, Parameter
 from elastic_env.joint import elasticity
+from elastic_env.joint.static_equilibrium import static_link_angle
 from elastic_env.motion.trajectory import STAND_S
 from elastic_env.rigid.leg_chains import LegTorque
 from elastic_env.world.robot_model import RobotModel, WalkerModel
@@ -79,7 +80,7 @@ def newton_link_angle(theta: Array, stiffness: Array, gravity: GravityModel) -> 
     """
     torque = gravity.gravity_torque
     gradient = gravity.gravity_gradient
-    return elasticity.static_link_angle(theta, stiffness, torque, gradient)
+    return static_link_angle(theta, stiffness, torque, gradient)
 
 
 class GravityCompensator(Compensator):

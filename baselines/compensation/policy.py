@@ -18,9 +18,10 @@ import numpy.typing as npt
 from typing_extensions import override
 
 from baselines.compensation.compiled_rows import Records
+from baselines.compensation.episode_start import require_start
 from baselines.compensation.memory_rows import put_rows, select_rows
 from elastic_env.core.errors import ElasticError, unknown_name
-from elastic_env.core.signals import Array, BoolArray, IntArray, Signal, SignalTable
+from elastic_env.core.signals import Array, IntArray, Signal, SignalTable
 from elastic_env.world.robot_model import RobotModel
 
 
@@ -44,7 +45,6 @@ class ObservationView:
         self._q = table.group("reference_angle")
         self._q_dot = table.group("reference_rate")
         self._q_ddot = table.group("reference_acceleration")
-        self._command = table.group("last_command")
         self.num_joints = self._theta.stop - self._theta.start
 
     def theta(self, rows: Array) -> Array:
@@ -72,38 +72,6 @@ class ObservationView:
             shape = np.shape(observation)
             raise ElasticError(f"an observation must have {needed}, got shape {shape}")
         return rows
-
-    def require_start(self, rows: Array, episode_start: Any) -> None:
-        """Refuse observations that are not the first of their episodes.
-
-        Args:
-            rows: Observations, (num_worlds, m).
-            episode_start: Worlds whose episode begins; None to decide by the observations.
-
-        Raises:
-            ElasticError: An episode goes on.
-        """
-        if not np.all(self.is_start(rows) if episode_start is None else episode_start):
-            at_rest = "a reference at rest, and no command yet"
-            sign = at_rest if self._clock is None else "clock.time"
-            raise ElasticError(
-                "predict() was called without `state` in what looks like the middle of an episode"
-                f" (a beginning is known by {sign}): this policy has memory; pass the state that"
-                " the last call returned, and episode_start=True where an episode begins"
-            )
-
-    def is_start(self, rows: Array) -> BoolArray:
-        """True for an observation that can be the first of an episode, (num_worlds,).
-
-        The clock decides, or without one: a reference at rest and no command yet. The last command
-        is then the reference, or zero, as an environment may begin.
-        """
-        if self._clock is not None:
-            return rows[:, self._clock][:, 0] < 1.5 * self._period_s
-        command = rows[:, self._command]
-        is_reference = (command == rows[:, self._q]).all(axis=1)
-        is_at_rest = (rows[:, self._q_dot] == 0.0).all(axis=1)
-        return is_at_rest & (is_reference | (command == 0.0).all(axis=1))
 
 
 _WALK_FIELDS: Mapping[str, tuple[int, ...]] = {
@@ -319,7 +287,7 @@ def resume_memory(policy: Any, rows: Array, state: Any, episode_start: Any) -> A
     """Memory for this call: the one of the last call, with new rows for new episodes.
 
     Args:
-        policy: Policy that begins the memory.
+        policy: Policy that begins the memory, with its `model`.
         rows: Observations, (num_worlds, m).
         state: State that the last call returned, or None.
         episode_start: Worlds whose episode begins; None for none where there is a state.
@@ -330,7 +298,7 @@ def resume_memory(policy: Any, rows: Array, state: Any, episode_start: Any) -> A
     if state is None:
         memory = policy.begin(rows)
         if memory is not None:
-            policy.view.require_start(rows, episode_start)
+            require_start(policy.model, rows, episode_start)
         return memory
     n = len(rows)
     if (number := count_rows(state)) != n:

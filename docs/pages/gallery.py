@@ -20,8 +20,8 @@ import numpy as np  # noqa: E402
 
 from baselines import PositionCompensator  # noqa: E402
 from elastic_env.core.signals import Array  # noqa: E402
-from elastic_env.joint.elasticity import static_link_angle  # noqa: E402
 from elastic_env.joint.model_joints import hinges_of  # noqa: E402
+from elastic_env.joint.static_equilibrium import static_link_angle  # noqa: E402
 from elastic_env.rendering.picture import Image  # noqa: E402
 from elastic_env.rendering.sag import SagViews  # noqa: E402
 from elastic_env.rendering.simple_bodies import add_simple_bodies  # noqa: E402

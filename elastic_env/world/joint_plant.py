@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 
 from elastic_env.core.signals import Array, BoolArray, Parameter
-from elastic_env.joint.elasticity import static_link_angle
+from elastic_env.joint.static_equilibrium import static_link_angle
 from elastic_env.motion.trajectory import Motion
 from elastic_env.rigid.tree.end_effector import EndEffector
 from elastic_env.world.further_sensors import SensorInputs

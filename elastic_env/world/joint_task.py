@@ -14,26 +14,18 @@ from elastic_env.core.episode_random import EpisodeRandom
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array, BoolArray, Signals
 from elastic_env.joint.time_step import require_stable
-from elastic_env.motion.trajectory import PlanTable
 from elastic_env.world import drawn_robot, records
 from elastic_env.world import joint_kernels as kernels
 from elastic_env.world.joint_config import JointConfig
 from elastic_env.world.joint_plant import JointPlant, JointTruth, place_at_rest
 from elastic_env.world.joint_signals import joint_groups
-from elastic_env.world.link_signals import (
-    LINK_IMU,
-    LINK_IMU_SENSOR,
-    METRICS_OF_ONE,
-    METRICS_OF_SEVERAL,
-    METRICS_OF_TOOL,
-    link_signals,
-)
+from elastic_env.world.link_constants import link_constants, link_schedule
+from elastic_env.world.link_signals import LINK_IMU, LINK_IMU_SENSOR, link_signals, metrics_of
 from elastic_env.world.pendulum_imu import make_pendulum_imu
 from elastic_env.world.physics import DIVERGED_RAD_S
-from elastic_env.world.records import Records, Sample, single_record
+from elastic_env.world.records import Records, Sample
 from elastic_env.world.rest_watch import RestWatch
 from elastic_env.world.robot_ranges import draw_robot, draw_robots
-from elastic_env.world.sensors import is_due
 from elastic_env.world.task import Task
 
 
@@ -67,9 +59,6 @@ class JointTask(Task):
         period_s = config.control_period_s
         counts = plant.true.encoder_counts_per_turn if scenario.encoder_counts else None
         drawn_robot.require_bearable_friction(plant.true, scenario)
-        metrics = METRICS_OF_ONE if len(joints) == 1 else METRICS_OF_SEVERAL
-        if plant.end_effector is not None:
-            metrics = metrics + METRICS_OF_TOOL
         require_stable(drawn_robot.stiffest_plant(plant.model, scenario), period_s)
         super().__init__(
             config=config,
@@ -81,7 +70,7 @@ class JointTask(Task):
             sensors=[name for name in config.sensors if name != LINK_IMU_SENSOR],
             joints=dict.fromkeys(joints),
             scenarios=[scenario] * num_worlds,
-            metrics=metrics,
+            metrics=metrics_of(len(joints), plant.end_effector is not None),
             kinds=[(counts, False), (counts, True)],
             action_bound_rad=config.action_bound_rad,
         )
@@ -96,16 +85,8 @@ class JointTask(Task):
         self._imu_bias = np.zeros(num_worlds)
         columns = self.observation_table.names
         self._imu_column = columns.index(LINK_IMU.name) if observe_imu else -1
-        self._schedule = _schedule(self._reference, scenario.imu.rate_hz, period_s)
-        terms = records.LINK_SCORES.names or ()
-        weights = {name: getattr(config.reward, name) for name in terms}
-        self._link_constants = single_record(
-            records.LINK_CONSTANTS,
-            weights=single_record(records.LINK_SCORES, **weights),
-            imu_noise_rad=scenario.imu.noise_rad,
-            imu_bias_rad=scenario.imu.bias_rad,
-            imu_sine_error_rad=scenario.imu.sine_error_rad,
-        )
+        self._schedule = link_schedule(self._reference, scenario.imu.rate_hz, period_s)
+        self._link_constants = link_constants(config)
         self._springs = drawn_robot.spring_ids(self.model, joints, config.form)
         self._has_drawn_joints = drawn_robot.draws_joints(scenario)
         has_one_robot = scenario.has_one_robot
@@ -217,13 +198,3 @@ class JointTask(Task):
         truth = worlds["truth"]
         time_s = truth["step"] * self.config.control_period_s
         return {"time_s": time_s, **signals, "rest": truth["rest"].copy()}
-
-
-def _schedule(reference: PlanTable, imu_rate_hz: float, period_s: float) -> Records:
-    """Records of `SCHEDULE`, one per control step."""
-    rows = np.zeros(reference.num_steps + 1, records.SCHEDULE)
-    rows["scored"] = reference.scored
-    rows["rest"] = reference.rest
-    rows["imu_is_due"] = is_due(np.arange(len(rows)), imu_rate_hz, period_s)
-    rows.flags.writeable = False
-    return rows

@@ -31,8 +31,14 @@ def _metrics_for(robots: str) -> tuple[Metric, ...]:
 
 
 METRICS_OF_ONE = _metrics_for("one")
-METRICS_OF_SEVERAL = _metrics_for("several")
-METRICS_OF_TOOL = _metrics_for("end_effector")
+_METRICS_OF_SEVERAL = _metrics_for("several")
+_METRICS_OF_TOOL = _metrics_for("end_effector")
+
+
+def metrics_of(num_joints: int, has_end_effector: bool) -> tuple[Metric, ...]:
+    """Figures of an episode of links on a fixed base."""
+    of_joints = METRICS_OF_ONE if num_joints == 1 else _METRICS_OF_SEVERAL
+    return (*of_joints, *_METRICS_OF_TOOL) if has_end_effector else of_joints
 
 
 def link_signals(joints: Records, worlds: Records, names: Sequence[str]) -> Signals:

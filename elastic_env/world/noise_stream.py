@@ -24,7 +24,7 @@ class NoiseStream:
         used: Number of used samples of each world, (num_worlds,), which is the index of the next.
     """
 
-    def __init__(self, num_worlds: int, record: np.dtype[Any], block: int = 250) -> None:
+    def __init__(self, num_worlds: int, record: np.dtype[Any], block: int = 256) -> None:
         # samples of a step are neighbours in memory: worlds mostly use theirs together
         self.samples = np.zeros((block, num_worlds), record)
         self.used = np.zeros(num_worlds, dtype=np.int64)
@@ -35,6 +35,7 @@ class NoiseStream:
     def restart(self, world: int, generator: Generator) -> None:
         """Begin a new stream for one world."""
         self._generators[world] = generator
+        self.used[world] = len(self.samples)
         self._refill(world)
 
     def next(self, worlds: BoolArray) -> Any:
@@ -47,18 +48,20 @@ class NoiseStream:
         self.used += worlds
         return sample
 
-    def prepare(self) -> None:
-        """Make sure that each world has an unused sample; its user increments `used`."""
-        block = len(self.samples)
-        if self._most_used >= block:
-            for world in np.flatnonzero(self.used == block):
-                self._refill(int(world))
-            self._most_used = int(self.used.max())
-        self._most_used += 1
+    def prepare(self, count: int = 1) -> None:
+        """Make sure that each world has so many unused samples; their user increments `used`."""
+        if self._most_used + count > len(self.samples):
+            for world in np.flatnonzero(self.used).tolist():
+                self._refill(world)
+            self._most_used = 0
+        self._most_used += count
 
     def _refill(self, world: int) -> None:
+        """Replace the used samples of a world by new ones behind the others."""
+        used = int(self.used[world])
         record = self.samples.dtype
-        shape = (len(self.samples), record.itemsize // 8)
-        numbers = self._generators[world].standard_normal(shape)
-        self.samples[:, world] = numbers.view(record)[:, 0]
+        numbers = self._generators[world].standard_normal((used, record.itemsize // 8))
+        samples = self.samples[:, world]
+        samples[:-used] = samples[used:]
+        samples[-used:] = numbers.view(record)[:, 0]
         self.used[world] = 0

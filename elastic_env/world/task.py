@@ -1,38 +1,27 @@
-"""The control step of a robot of elastic joints, from the command to the observation.
+"""A task: the control step with its robots, its episodes and their scores."""
 
-    command → (physics) → truth → measured → score → observation
-
-Kernels do the arithmetic, see `elastic_env.world.joint_kernels`. Blocks of records hold the last
-control steps. Signals and metrics are computed from them on demand.
-"""
-
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Sequence
-from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import mujoco
 import numpy as np
-import numpy.typing as npt
-from gymnasium.error import ResetNeeded
 
 from elastic_env.core.compiled import compile_now
 from elastic_env.core.episode_random import EpisodeRandom
 from elastic_env.core.signals import Array, BoolArray, Signal, Signals, SignalTable
 from elastic_env.motion.trajectory import Motion, PlanTable
-from elastic_env.world import further_sensors as further
-from elastic_env.world import joint_kernels as kernels
 from elastic_env.world import joint_signals, records
-from elastic_env.world.further_sensors import FurtherSensors, SensorInputs
+from elastic_env.world.control_step import ControlStep
+from elastic_env.world.further_sensors import FurtherSensors
 from elastic_env.world.many_worlds import simulate
 from elastic_env.world.metrics import EpisodeMetrics, Metric
 from elastic_env.world.noise_stream import NoiseStream
 from elastic_env.world.physics import Simulation, substeps
-from elastic_env.world.records import Records, Sample, joint_rules, spring_torque
+from elastic_env.world.records import Records, Sample, joint_rules
 from elastic_env.world.robot_model import RobotModel
 from elastic_env.world.robot_ranges import DrawnRobot
 from elastic_env.world.scenario import Scenario
-from elastic_env.world.step_info import StepInfo
 
 DIVERGED = "diverged"
 """Reason of termination where the simulation produced a bad number; MuJoCo alone would restart
@@ -46,22 +35,7 @@ _MOST_STEPS = 256
 """Bounds of the control steps that are scored together."""
 
 
-class Transition(NamedTuple):
-    """Result of a control step, one row per world."""
-
-    observation: Array
-    reward: Array
-    terminated: BoolArray
-    truncated: BoolArray
-    info: dict[str, Any]
-
-    @property
-    def done(self) -> BoolArray:
-        """Worlds whose episode has ended."""
-        return self.terminated | self.truncated
-
-
-class Task(ABC):
+class Task(ControlStep):
     """Rules of an environment.
 
     Args:
@@ -81,14 +55,12 @@ class Task(ABC):
 
     Attributes:
         failure_names: Reasons for a termination in addition to `DIVERGED`.
-        world_type: Structured type of a world's record in a control step: truth, measured, scores.
         noise_type: Structured type of a noise sample.
         num_steps: Control steps of an episode that does not fail.
         fewest_control_steps: Control steps of the shortest episode that does not fail.
     """
 
     failure_names: tuple[str, ...] = ()
-    world_type: np.dtype[Any]
     noise_type: np.dtype[Any]
 
     def __init__(
@@ -125,7 +97,7 @@ class Task(ABC):
         self._reference = reference
         self._has_sensors = bool(sensors)
         further_terms = type(self).further_reward_terms
-        self._has_further_terms = further_terms is not Task.further_reward_terms
+        self._has_further_terms = further_terms is not ControlStep.further_reward_terms
         self._width = len(self.observation_table)
         self._addresses = records.joint_addresses(model, names)
         groups = joint_signals.JOINT_COLUMNS
@@ -195,7 +167,6 @@ class Task(ABC):
         for world in np.flatnonzero(worlds).tolist():
             self._draw(world, random[world])
         self._place(worlds)
-        self._noise.prepare()
         self._begin_worlds(worlds)
         for block in (self._joints, self._worlds):
             block[last][worlds] = block[present][worlds]
@@ -203,45 +174,6 @@ class Task(ABC):
             self._sensors.restart(worlds, random, self._sensor_inputs())
         self._has_episode = self._has_episode | worlds
         self._all_have_episodes = bool(self._has_episode.all())
-
-    def step(self, action: npt.ArrayLike) -> Transition:
-        """Advance by one control period under the actions, (num_worlds, n) [rad].
-
-        Raises:
-            ActionError: Wrong shape, or a value that is not finite.
-            ResetNeeded: A world has not begun an episode yet.
-        """
-        if not self._all_have_episodes:
-            missing = np.flatnonzero(~self._has_episode).tolist()
-            some = f", of the worlds {missing} too" if self._has_episode.any() else ""
-            raise ResetNeeded(f"reset() comes before the first step(){some}")
-        offset, is_clipped = self._command(action)
-        self._disturb()
-        self.simulation.advance(self.num_substeps)
-        self._advance_rows(1)
-        observation, reward, ends, is_over = self._sense(offset, is_clipped)
-        compute_rest = partial(self._step_info, self.sample())
-        info = StepInfo({"termination": self._no_reason}, compute_rest)
-        if is_over:
-            info["termination"] = self._termination_reasons(ends)
-            self.score()
-            info["episode_metrics"] = {
-                **self._metrics.values(),
-                **dict(zip(self._failures, ends, strict=False)),
-            }
-        return Transition(observation, reward, ends[-2], ends[-1], info)
-
-    def observe(self) -> Array:
-        """Observe the present state, (num_worlds, len(observation_table))."""
-        observation = np.empty((self.num_worlds, self._width))
-        kernels.observe_all_joints(self._step, observation)
-        self._observe_worlds(observation)
-        self._observe_sensors(observation)
-        return observation
-
-    def sample(self) -> Sample:
-        """Return the records of the present control step."""
-        return Sample(self._joints[self._row], self._worlds[self._row])
 
     def signals(self, sample: Sample | None = None) -> Signals:
         """Return truth and scores by name, one value per row; by default of the present step."""
@@ -278,10 +210,6 @@ class Task(ABC):
         terms = {name: scores[name].copy() for name in scores.dtype.names or ()}
         return terms | self.further_reward_terms(sample)
 
-    def further_reward_terms(self, sample: Sample) -> dict[str, Array]:  # noqa: ARG002
-        """Return terms that a user's task adds to the reward, one value per row."""
-        return {}
-
     @abstractmethod
     def masks(self, sample: Sample) -> dict[str, BoolArray]:
         """Return the mask "scored" of rows that count, and the other masks of the metrics."""
@@ -310,14 +238,6 @@ class Task(ABC):
         """Fill truth and measurements at the start of an episode in some worlds."""
 
     @abstractmethod
-    def _sense_worlds(self, control: tuple[Any, ...]) -> bool:
-        """Sense, score, end and observe a step by parts of `kernels.Control`; True if one ends."""
-
-    @abstractmethod
-    def _observe_worlds(self, observation: Array) -> None:
-        """Fill the columns of the present state that are not the joints'."""
-
-    @abstractmethod
     def _signals(self, joints: Records, worlds: Records) -> Signals:
         """`signals` from the truth of the joints, (rows, n), and records of worlds, (rows,)."""
 
@@ -331,96 +251,17 @@ class Task(ABC):
         truth["damping"] = assumed.damping * robot.damping
         truth["backlash"] = assumed.backlash + robot.backlash_rad
 
-    def _disturb(self) -> None:  # noqa: B027  most robots are not pushed
-        """Apply external forces during the coming control period."""
-
-    _periods = 1.0
-    """Control periods in the last step."""
-
-    @property
-    def _step(self) -> tuple[Any, ...]:
-        """Arguments of `kernels.step_at` for the present step."""
-        return (self._joints, self._worlds, self._row, *self._constants)
-
-    def _command(self, action: npt.ArrayLike) -> tuple[Array, BoolArray]:
-        """Command the servos; return the clipped offsets and the worlds with a clipped one."""
-        values = np.asarray(action)
-        if values.dtype.kind not in "fiub" or values.shape != self._action_shape:
-            raise joint_signals.action_error(values, *self._action_rules)
-        offset = values.astype(np.float64, order="C")
-        is_clipped = np.empty(self.num_worlds, dtype=np.bool_)
-        arrays = (offset, self._bound, is_clipped, self.simulation.ctrl)
-        if not kernels.write_commands(self._step, *arrays, *kernels.EVERY_WORLD):
-            raise joint_signals.action_error(values.astype(np.float64), *self._action_rules)
-        return offset, is_clipped
-
-    def _sense(self, offset: Array, is_clipped: BoolArray) -> tuple[Array, Array, BoolArray, bool]:
-        """Return observation, reward and ends of the last step, and True if an episode ends."""
-        n = self.num_worlds
-        observation = np.empty((n, self._width))
-        reward = np.empty(n)
-        ends = np.empty((len(self._failures) + 2, n), dtype=np.bool_)
-        diverged = self.simulation.divergence()
-        self._noise.prepare()
-        command = (offset, is_clipped, diverged, self._periods)
-        is_over = self._sense_worlds((*command, observation, reward, ends))
-        if self._has_sensors:
-            self._sensors.measure(~diverged, self._sensor_inputs())
-            self._observe_sensors(observation)
-        if self._has_further_terms:
-            for term in self.further_reward_terms(self.sample()).values():
-                reward += term
-        return observation, reward, ends, is_over
-
-    def _observe_sensors(self, observation: Array) -> None:
-        """Fill the columns of further sensors."""
-        if self._has_sensors:
-            is_delayed = self._rules["is_delayed"][self._kind]
-            first = self._width - len(self._sensors.signals)
-            observation[:, first:] = self._sensors.columns(is_delayed)
-
-    def _sensor_inputs(self) -> SensorInputs:
-        """Return the truth for further sensors; the specific force lags by one physics step."""
-        truth = self._joints[self._row]["truth"]
-        force = np.full((self.num_worlds, 3), np.nan)
-        if further.ACCELEROMETER in self.config.sensors:
-            begin = int(self.model.sensor(further.ACCELEROMETER).adr[0])
-            force = self.simulation.bind("sensordata")[:, begin : begin + 3].copy()
-        return SensorInputs(truth["q"].copy(), spring_torque(truth), force)
-
     def _step_info(self, sample: Sample) -> dict[str, Any]:
         """Reward terms, signals and clipping of a step."""
         clipped = sample.worlds["truth"]["clipped"].astype(np.float64)
         terms = self.reward_terms(sample)
         return {"reward_terms": terms, **self.signals(sample), "clipped": clipped}
 
-    def _advance_rows(self, count: int) -> None:
-        """Advance to new records, in a new block if this one is full.
-
-        Samples may still refer to the old block.
-        """
-        if self._row + count >= len(self._joints):
-            self.score()
-            present = slice(self._row - 1, self._row + 1)
-            self._begin_block(self._joints[present], self._worlds[present])
-        self._row += count
-
-    def _begin_block(self, joints: Records, worlds: Records) -> None:
-        """Allocate records for the next steps, after those of the last step and the present one."""
-        steps = self._steps_per_block + 2
-        self._joints = np.zeros((steps, *joints.shape[1:]), records.JOINT)
-        self._worlds = np.zeros((steps, self.num_worlds), self.world_type)
-        self._joints[:2] = joints
-        self._worlds[:2] = worlds
-        self._row = 1
-        self._unscored = 2
-
     def _compile_kernels(self) -> None:
         """Compile all kernels by a control step whose records are discarded."""
         every = np.ones(self.num_worlds, dtype=np.bool_)
         offset, is_clipped = self._command(np.zeros(self._action_shape))
         self.simulation.ctrl[:] = 0.0
-        self._noise.prepare()
         self._begin_worlds(every)
         self._advance_rows(1)
         self._sense(offset, is_clipped)
@@ -430,10 +271,11 @@ class Task(ABC):
         joints = np.zeros_like(self._joints[:2])
         self._begin_block(joints, np.zeros_like(self._worlds[:2]))
 
-    def _termination_reasons(self, ends: BoolArray) -> npt.NDArray[np.str_]:
-        """First reason of termination that applies in every world, "" for none."""
-        longest = max(map(len, self._failures))
-        reasons = np.full(self.num_worlds, "", dtype=f"<U{longest}")
-        for reason, failed in reversed([*zip(self._failures, ends, strict=False)]):
-            reasons[failed] = reason
-        return reasons
+    def _end_info(self, ends: BoolArray) -> dict[str, Any]:
+        self.score()
+        failed = dict(zip(self._failures, ends, strict=False))
+        # of the reasons that apply in a world, the first one counts
+        reasons = np.full(self.num_worlds, "", dtype=f"<U{max(map(len, failed))}")
+        for reason, worlds in reversed(failed.items()):
+            reasons[worlds] = reason
+        return {"termination": reasons, "episode_metrics": {**self._metrics.values(), **failed}}

@@ -12,15 +12,9 @@ from gymnasium.vector.utils import batch_space
 from elastic_env.core.errors import ConfigurationError, quote, unknown_name
 from elastic_env.core.signals import Array, BoolArray, Signals
 from elastic_env.rendering.picture import Picture
-from elastic_env.world.env import (
-    Action,
-    ElasticEnv,
-    Flags,
-    Info,
-    Observation,
-    Seeds,
-    _EnvBase,
-)
+from elastic_env.world.control_step import Transition
+from elastic_env.world.env import ElasticEnv
+from elastic_env.world.env_base import Action, EnvBase, Flags, Info, Observation, Seeds
 from elastic_env.world.episode_seeds import (
     episode_generators,
     new_generator,
@@ -28,11 +22,11 @@ from elastic_env.world.episode_seeds import (
     seeds_of,
 )
 from elastic_env.world.physics import Simulation
-from elastic_env.world.task import Task, Transition
+from elastic_env.world.task import Task
 
 
 class ElasticVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]  `spec` is a property
-    _EnvBase, gymnasium.vector.VectorEnv[Observation, Action, npt.NDArray[Any]]
+    EnvBase, gymnasium.vector.VectorEnv[Observation, Action, npt.NDArray[Any]]
 ):
     """Many worlds of a task on a thread pool.
 
