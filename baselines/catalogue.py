@@ -377,9 +377,9 @@ def policies_of(is_walker: bool) -> Mapping[str, NamedPolicy]:
     return ON_THE_WALKER if is_walker else ON_JOINTS
 
 
-BEST_ON_THE_WALKER: str | None = "foothold"
+BEST_ON_THE_WALKER = "foothold"
 """Best policy of the walker without training and with the standard sensors; comparisons of
 residuals use it.
 """
-BEST_ON_JOINTS: str | None = "friction"
+BEST_ON_JOINTS = "friction"
 """The same for robots on a fixed base."""

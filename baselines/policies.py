@@ -41,8 +41,8 @@ def track(name: str, is_walker: bool = True) -> Track:
     return Track.STANDARD if named is None else named.track
 
 
-def best_analytic(is_walker: bool = True) -> str | None:
-    """Name of the best policy without learning and with the standard sensors; None without one."""
+def best_analytic(is_walker: bool = True) -> str:
+    """Name of the best policy without learning and with the standard sensors."""
     return BEST_ON_THE_WALKER if is_walker else BEST_ON_JOINTS
 
 

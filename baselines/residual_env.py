@@ -185,7 +185,6 @@ class ResidualVectorWrapper(gymnasium.vector.VectorWrapper[Any, Any, Any]):
         self.single_observation_space = self._loop.observation_space
         self.single_action_space = self._loop.action_space
         self.observation_space = batch_space(self.single_observation_space, n)
-
         self.action_space = batch_space(self.single_action_space, n)
         self._rows = np.zeros((n, 0))
         self._last: Array | None = None

@@ -18,7 +18,7 @@ import numpy.typing as npt
 from typing_extensions import override
 
 from baselines.compensation.compiled_rows import Records
-from baselines.compensation.episode_start import require_start
+from baselines.compensation.first_observation import require_start
 from baselines.compensation.memory_rows import put_rows, select_rows
 from elastic_env.core.errors import ElasticError, unknown_name
 from elastic_env.core.signals import Array, IntArray, Signal, SignalTable

@@ -1,4 +1,4 @@
-r"""Growth of a compensation from zero while the robot stands.
+r"""Growth of a compensation from zero while the robot stands, over the option `ramp_s`.
 
 The robot begins in static equilibrium without compensation. With compensation its equilibrium is
 elsewhere. A walker that moves there within the second of standing would go on swinging on its

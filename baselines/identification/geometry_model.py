@@ -28,9 +28,10 @@ from typing import Literal, NamedTuple, Self
 
 import numpy as np
 
-from baselines.identification.rotations import rotation_about_z, rotation_of
+from baselines.identification.rotations import rotation_of
 from elastic_env.core.errors import ElasticError
 from elastic_env.core.signals import Array, BoolArray, IntArray
+from elastic_env.rigid.leg_kinematics import rotation_z
 from elastic_env.rigid.tree.links import Tree
 
 Geometry = Literal["offsets", "dh", "full"]
@@ -309,7 +310,7 @@ class GeometryModel:
             origin = np.zeros(3) if parent < 0 else anchor[parent]
             anchor[j] = origin + R @ (self.anchor[j] + self.nominal[j] @ parameters.length[j])
             housing[j] = R @ (self.nominal[j] @ errors[j])
-            link[j] = housing[j] @ deflections[:, j] @ rotation_about_z(angles[:, j])
+            link[j] = housing[j] @ deflections[:, j] @ rotation_z(angles[:, j])
             lever[j] = link[j] @ self.weight_moment[j]
         load = self.weight.copy()
         for j in range(n - 1, -1, -1):

@@ -41,8 +41,6 @@ UNITS = {
 MOST_POSES = 10_000
 """Rows of a log."""
 
-_TABLES = ("theta", "measured", "direction", "known_torque")
-"""Fields of a log with a row per pose."""
 _UNIT_SPELLINGS = {"Nm": "N·m", "N*m": "N·m", "N m": "N·m", "": "1", "-": "1"}
 _RANGE_MARGIN_RAD = 0.5
 """Angle beyond the model's range that is accepted: homing errors and bent joints need less."""
@@ -81,9 +79,8 @@ class PoseLog:
 
     def part(self, poses: IntArray) -> "PoseLog":
         """Log of some of the poses."""
-        tables = {name: getattr(self, name) for name in _TABLES}
-        parts = {name: rows[poses] for name, rows in tables.items() if rows is not None}
-        return replace(self, **parts)
+        arrays = {k: v[poses] for k, v in vars(self).items() if isinstance(v, np.ndarray)}
+        return replace(self, **arrays)
 
 
 def read_log(

@@ -200,7 +200,5 @@ def _best_pose(rows: Array, information: Array, chosen: list[int], k: int) -> tu
 
 def _gain(rows: Array, information: Array) -> Array:
     """Gain of each pose in log det M, (candidates,), by the determinant lemma."""
-    if not len(information):
-        return np.zeros(len(rows))
     inner = rows @ np.linalg.solve(information, rows.transpose(0, 2, 1))
     return np.linalg.slogdet(np.eye(rows.shape[1]) + inner)[1]

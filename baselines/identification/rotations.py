@@ -15,16 +15,6 @@ def rotation_of(vectors: Array) -> Array:
     return flat.reshape(*np.shape(vectors)[:-1], 3, 3)
 
 
-def rotation_about_z(angles: Array) -> Array:
-    """Rotations about z, (N,) [rad] to (N, 3, 3)."""
-    R = np.zeros((len(angles), 3, 3))
-    R[:, 0, 0] = R[:, 1, 1] = np.cos(angles)
-    R[:, 1, 0] = np.sin(angles)
-    R[:, 0, 1] = -R[:, 1, 0]
-    R[:, 2, 2] = 1.0
-    return R
-
-
 def left_jacobian(vectors: Array) -> Array:
     """Angular velocity by the rate of a rotation vector, (..., 3) to (..., 3, 3)."""
     angle = np.linalg.norm(vectors, axis=-1)[..., None, None]

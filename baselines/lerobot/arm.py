@@ -300,9 +300,7 @@ def _compensated_motors(
 
 
 def _is_held(content: Any, joint: str) -> bool:
-    if not isinstance(content, Mapping):
-        return False
-    key = key_of(content, joint)
+    key = key_of(content, joint) if isinstance(content, Mapping) else None
     return key is not None and content[key] == HELD
 
 

@@ -37,7 +37,11 @@ def sway_frequencies(
     feet = biped.ankles if ankles is None else ankles
 
     def angles_at(x: Array) -> Array:
-        return _angles(biped, pelvis, feet, x)
+        """Angles with both soles on the ground, from pelvis motions (n, 6) to (n, 12)."""
+        R = _rotations(x)
+        relative = (feet - (pelvis + x[:, :3])[:, None]) @ R - biped.hips
+        feet_R = np.broadcast_to(R.swapaxes(-1, -2)[:, None], (len(x), 2, 3, 3))
+        return legs.leg_angles(biped.leg, relative, feet_R).reshape(len(x), -1)
 
     q = angles_at(np.zeros((1, _DOF)))[0]
     gravity = np.array([0.0, 0.0, -biped.gravity])
@@ -68,11 +72,3 @@ def sway_frequencies(
 def _rotations(x: Array) -> Array:
     tilted = legs.rotation_z(x[:, 5]) @ legs.rotation_y(x[:, 4])
     return tilted @ legs.rotation_x(x[:, 3])
-
-
-def _angles(biped: Biped, pelvis: Array, ankles: Array, x: Array) -> Array:
-    """Return angles with both soles on the ground, from pelvis motions (n, 6) to (n, 12)."""
-    R = _rotations(x)
-    relative = (ankles - (pelvis + x[:, :3])[:, None]) @ R - biped.hips
-    feet_R = np.broadcast_to(R.swapaxes(-1, -2)[:, None], (len(x), 2, 3, 3))
-    return legs.leg_angles(biped.leg, relative, feet_R).reshape(len(x), -1)

@@ -1,6 +1,6 @@
 """The control step of a robot of elastic joints, from the command to the observation.
 
-    command → (physics) → truth → measured → score → observation
+    command → (physics) → truth → measured → ends, scores and observation
 
 Kernels do the arithmetic, see `elastic_env.world.joint_kernels`. Blocks of records hold the last
 control steps. Signals and metrics are computed from them on demand.
@@ -71,8 +71,9 @@ class ControlStep(ABC):
     """First row that is not in the metrics yet."""
     _steps_per_block: int
     _constants: tuple[Any, ...]
-    """Arguments of `kernels.step_at` after the row."""
+    """Fields of `kernels.Step` from `addresses` on."""
     _rules: Records
+    """Control period and encoder of each kind of worlds, (kinds,)."""
     _kind: IntArray
     """Index of the rules of each world, (num_worlds,)."""
     _noise: NoiseStream
@@ -90,8 +91,9 @@ class ControlStep(ABC):
     _width: int
     """Columns of the observation."""
     _failures: tuple[str, ...]
+    """Reasons of termination, the first rows of `kernels.Control.ends`."""
     _no_reason: npt.NDArray[np.str_]
-    """Reason of termination of every world, "", where none ends."""
+    """Reasons of termination where no world ends: empty texts."""
 
     _periods = 1.0
     """Control periods in the last step."""
@@ -172,7 +174,7 @@ class ControlStep(ABC):
             observation[:, first:] = self._sensors.columns(is_delayed)
 
     def _sensor_inputs(self) -> SensorInputs:
-        """Return the truth for further sensors; the specific force lags by one physics step."""
+        """Return the truth for further sensors; that of the accelerometer is a physics step old."""
         truth = self._joints[self._row]["truth"]
         force = np.full((self.num_worlds, 3), np.nan)
         if further.ACCELEROMETER in self.config.sensors:
@@ -217,7 +219,7 @@ class ControlStep(ABC):
 
     @abstractmethod
     def _sense_worlds(self, control: tuple[Any, ...]) -> bool:
-        """Sense, score, end and observe a step by parts of `kernels.Control`; True if one ends."""
+        """Sense, end, score and observe by parts of `kernels.Control`; True if an episode ends."""
 
     @abstractmethod
     def _observe_worlds(self, observation: Array) -> None:

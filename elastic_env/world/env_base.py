@@ -25,7 +25,7 @@ class EnvBase:
     """Properties of both kinds of environments."""
 
     task: Task
-    """The rules of this environment."""
+    """The rules of this environment; its control step is a `ControlStep`."""
     _picture: Picture | None = None
     _make_picture: Callable[[], Picture] | None = None
     _spec: EnvSpec | None = None

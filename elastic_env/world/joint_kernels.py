@@ -1,13 +1,13 @@
-"""Compiled control step of joints without the physics: command, read, measure, score, observe.
+"""Compiled control step of joints without the physics: command, read, measure, observe, score.
 
 One pass over the worlds, between MuJoCo's state and the observation. A world's numbers depend only
 on its own row. Records have named fields, see `elastic_env.world.records`. First the joints of
 every robot, then links on a fixed base; walkers have `elastic_env.world.walk_kernels`.
 
-Every size comes from a type or from an array. A kernel that Python calls takes plain tuples and
-names their parts itself: a named tuple costs Numba a microsecond more. The control step compiles
-for a GPU too, see `tests.ptx`. So its functions return no part of an array, and they allocate only
-constant shapes.
+Sizes come from types and arrays, so that one kernel serves any robot. A kernel that Python calls
+takes `Step`, `Links` and `Control` as plain tuples and names their parts itself: a named tuple
+costs Numba a microsecond more. The control step compiles for a GPU too, see `tests.ptx`. So its
+functions allocate only arrays of constant shapes.
 """
 
 import math
@@ -29,8 +29,8 @@ class Step(NamedTuple):
     """Joints and worlds in a control step: records, and constants of an episode.
 
     Attributes:
-        last_joints, joints: Records of the last step and of the present one, (num_worlds, n). The
-            kernels fill the present one.
+        last_joints, joints: Records of the last step and of the present one, (num_worlds, n). After
+            the physics the kernels fill the present one.
         last_worlds, worlds: The same for the worlds, (num_worlds,).
         addresses: Records of `ADDRESS`: indices of the joints in the physics, (n,).
         columns: First column of each group of the observation, (1,).
@@ -68,13 +68,13 @@ class Control(NamedTuple):
     Attributes:
         offset: Command offsets within their bounds, (num_worlds, n) [rad].
         is_clipped: Worlds whose action was beyond its bounds.
-        diverged: Worlds that diverged; the kernels add worlds that are too fast. They keep truth
-            and measurements of the last step.
+        diverged: Worlds that diverged; the kernels add worlds that are too fast. They keep angles,
+            rates and measurements of the last step.
         periods: Elapsed control periods; more than 1 where hardware has missed some.
         observation: Observation, (num_worlds, columns).
         reward: Reward, (num_worlds,).
-        ends: True where a world diverged, failed in another way, is terminated, is truncated,
-            (ways, num_worlds).
+        ends: True where a world ends, (ways, num_worlds): a row for each reason of termination, the
+            divergence first, then one for termination and one for truncation.
     """
 
     offset: Array
@@ -281,7 +281,7 @@ def begin_links(qpos: Array, qvel: Array, step: Any, links: Any, worlds: BoolArr
 def sense_links(
     qpos: Array, qvel: Array, step: Any, links: Any, control: Any, first: int, stride: int
 ) -> bool:
-    """Process links on a fixed base after the physics: read, measure, end, score, observe.
+    """Process links on a fixed base after the physics: read, measure, observe, end, score.
 
     Args:
         qpos: Positions of all worlds.
@@ -325,7 +325,7 @@ def sense_links(
         for i in range(len(step.addresses)):
             error = step.joints[world, i].truth.q_ref - step.joints[world, i].truth.q
             total += error * error
-        # penalties that grow without saturating
+        # penalties of error and rate grow without saturating
         weights = links.constants[0].weights
         scores.link_error = weights.link_error * -math.sqrt(total / len(step.addresses))
         scores.command_rate = weights.command_rate * -truth.command_rate

@@ -33,7 +33,7 @@ class JointTask(Task):
     """Rules of a robot of elastic joints on a fixed base.
 
     Args:
-        config: Reference, scenario, sensors, rewards, periods, and the plant that follows.
+        config: Reference, scenario, sensors, rewards, periods, and the robot.
         num_worlds: Number of worlds.
 
     Raises:
@@ -110,7 +110,10 @@ class JointTask(Task):
         super().score()
 
     def masks(self, sample: Sample) -> dict[str, BoolArray]:
-        """Mask of scored steps: windows at rest of `hold`; else all except standing and onset."""
+        """Mask of scored steps: where poses are held, their windows at rest.
+
+        In other motions: all steps but those of standing and of the onset.
+        """
         return {"scored": sample.worlds["truth"]["scored"]}
 
     def truth(self) -> JointTruth:
@@ -144,16 +147,16 @@ class JointTask(Task):
         simulation = self.simulation
         addresses = self._addresses
         truth = self._joints[self._row]["truth"][worlds]
-        if self._has_drawn_joints:
-            for world in np.flatnonzero(worlds).tolist():
+        drawn = np.flatnonzero(worlds & self._has_drawn_joints)
+        for world in drawn.tolist():
 
-                def field(name: str, world: int = world) -> Array:
-                    return simulation.vary(name)[world]
+            def field(name: str, world: int = world) -> Array:
+                return simulation.vary(name)[world]
 
-                links = addresses["q_dot"]
-                robot = self._robots[world]
-                scenario = self.config.scenario
-                drawn_robot.set_joints(field, self.model, self._springs, links, robot, scenario)
+            links = addresses["q_dot"]
+            robot = self._robots[world]
+            scenario = self.config.scenario
+            drawn_robot.set_joints(field, self.model, self._springs, links, robot, scenario)
         q_ref = self._reference.motion[self._reference.plan_of_world[worlds], 0, 0]
         place_at_rest(self._plant, simulation, addresses, worlds, q_ref, truth)
         if self._has_sensors:

@@ -17,7 +17,7 @@ class NoiseStream:
     Args:
         num_worlds: Number of worlds.
         record: Structured type of a sample, with real numbers only.
-        block: Samples that are drawn at once.
+        block: Samples that are drawn at once; no more can be prepared.
 
     Attributes:
         samples: Samples of the present block, (block, num_worlds).
@@ -50,6 +50,7 @@ class NoiseStream:
 
     def prepare(self, count: int = 1) -> None:
         """Make sure that each world has so many unused samples; their user increments `used`."""
+        assert count <= len(self.samples)
         if self._most_used + count > len(self.samples):
             for world in np.flatnonzero(self.used).tolist():
                 self._refill(world)

@@ -32,7 +32,7 @@ _ROWS_PER_BLOCK = 4096
 """Rows, which are steps of all worlds, whose signals are computed together."""
 _FEWEST_STEPS = 16
 _MOST_STEPS = 256
-"""Bounds of the control steps that are scored together."""
+"""Bounds of the control steps in a block of records."""
 
 
 class Task(ControlStep):
@@ -106,7 +106,7 @@ class Task(ControlStep):
         self._kind = np.zeros(num_worlds, dtype=np.int64)
         self._scenarios = scenarios
         self._robots: dict[int, DrawnRobot] = {}
-        self._noise = NoiseStream(num_worlds, self.noise_type)
+        self._noise = NoiseStream(num_worlds, self.noise_type, block=_MOST_STEPS)
         self._bound = self.action_table.space(np.float32).high.astype(np.float64)
         self._action_shape = (num_worlds, len(self._bound))
         self._failures = (DIVERGED, *self.failure_names)

@@ -91,11 +91,10 @@ class Compare(Model):
                 "name a configuration or a preset, which --list shows, or, with --resume, the run"
                 " to go on with"
             )
-        if self.episodes is not None:
-            with name_options():
+        with name_options():
+            if self.episodes is not None:
                 config = config.replace(episodes=self.episodes, scenario_episodes={})
-        if self.policies:
-            with name_options():
+            if self.policies:
                 config = config.replace(policies=list(self.policies), figure_policies=[])
         published = ()
         if self.published is not None:

@@ -46,9 +46,6 @@ class Sweep(Model):
         return self.label or self.option
 
 
-_DEFAULT_POLICIES = [PolicySpec(name=name) for name in ("uncompensated", "input")]
-
-
 class CompareConfig(CodeNamingModel):
     """A comparison, as read from `configs/*.yaml`."""
 
@@ -62,7 +59,7 @@ class CompareConfig(CodeNamingModel):
     """
     scenarios: Annotated[Entries[Title], Once] = ["nominal"]
     """Scenarios by name."""
-    policies: Entries[PolicySpec] = _DEFAULT_POLICIES
+    policies: Entries[PolicySpec] = [PolicySpec(name=name) for name in ("uncompensated", "input")]
     """Baselines by name, or mappings with name, label, options, and env_options of their own."""
     episodes: NumEpisodes = 1
     """Episodes per cell."""

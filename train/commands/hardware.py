@@ -29,7 +29,7 @@ from elastic_env.robots.testbed.environment import configure_testbed
 from train.commands.hardware_arm import ArmOptions, ArmSetup
 from train.commands.hardware_arm_dry_run import emulator_config
 from train.commands.hardware_compensate import Compensate, LogPoses
-from train.commands.options import HardwareOptions, MotionOrDefault
+from train.commands.options import HardwareOptions, MotionOrDefault, given_options
 from train.evaluate.conditions import Condition, PolicySpec
 from train.evaluate.rollout import ControlStep, control_steps, make_policy
 from train.runs.console import make_table
@@ -306,12 +306,8 @@ class Emulate(Model):
             return None
         if self.robot is None or self.joints is None or self.mounting is None:
             raise ConfigurationError("an emulated arm needs --robot, --joints and --mounting")
-        unused = [
-            "--" + name.replace("_", "-")
-            for name in ("ids", "model_number", "baudrate", "scenario", "stiffness")
-            if getattr(self, name) != Emulate.model_fields[name].default
-        ]
-        if unused:
+        servo_options = ["ids", "model_number", "baudrate", "scenario", "stiffness"]
+        if unused := given_options(self, servo_options):
             raise ConfigurationError(
                 "an emulated arm has the joints of --joints and the servos of"
                 f" --mounting; leave out {list_names(unused)}"

@@ -17,7 +17,7 @@ from baselines.identification.geometry_result import (
 )
 from baselines.identification.holdout import HoldoutProblem
 from baselines.identification.pose_log import PoseLog
-from elastic_env.core.errors import list_names, unknown_name
+from elastic_env.core.errors import list_names, require_known
 from elastic_env.joint.model_file import read_model
 from elastic_env.joint.model_joints import held_positions
 from elastic_env.rigid.tree.end_effector import site_or_body
@@ -77,9 +77,7 @@ def pose_problem(
     end_effector: str,
 ) -> tuple[GeometryProblem, Tree]:
     """The poses of a log as a problem, and the links of the model."""
-    for joint in options.free:
-        if joint not in log.joints:
-            raise unknown_name("joint of the log", joint, log.joints)
+    require_known("joint of the log", options.free, log.joints)
     tree = Tree.of(model, log.joints, held_positions(model, log.joints))
     names = [end_effector]
     if log.kind == "markers":

@@ -53,7 +53,10 @@ def play(
         steps = steps_within(task, max_s)
         policy = make_policy(condition.policy, env)
         if hasattr(policy, "rehearse"):
-            _rehearse(policy, condition, console)
+            # before the window opens or the film begins
+            console.print(f"{condition.policy.title} learns on this robot first")
+            with closing(make_vector_env(condition, 1)) as worlds:
+                policy.rehearse(worlds, condition.seed)
         played = episode(env, policy, condition, steps, console)
         if video is None:
             _play_in_real_time(played, period)
@@ -74,13 +77,6 @@ def steps_within(task: Any, max_s: float | None) -> int:
         return task.num_steps
     steps = max_s / task.assumed_model.control_period_s
     return max(round(min(steps, task.num_steps)), 1)
-
-
-def _rehearse(policy: Any, condition: Condition, console: Console) -> None:
-    """Let a policy learn on the robot, before the window opens or the film begins."""
-    console.print(f"{condition.policy.title} learns on this robot first")
-    with closing(make_vector_env(condition, 1)) as env:
-        policy.rehearse(env, condition.seed)
 
 
 def episode(

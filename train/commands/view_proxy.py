@@ -133,7 +133,9 @@ class Access:
     @property
     def is_local(self) -> bool:
         """True if only programs on this machine reach the page."""
-        return _is_loopback(self.host)
+        if self.host.lower() == "localhost":
+            return True
+        return _is_address(self.host) and ipaddress.ip_address(self.host).is_loopback
 
     @property
     def _is_everywhere(self) -> bool:
@@ -216,12 +218,6 @@ def _is_address(name: str) -> bool:
     return True
 
 
-def _is_loopback(host: str) -> bool:
-    """Return True if a host is this machine's loopback."""
-    is_name = host.lower() == "localhost"
-    return is_name or (_is_address(host) and ipaddress.ip_address(host).is_loopback)
-
-
 def open_listener(host: str = LOOPBACK, port: int = 0) -> socket.socket:
     """Open a socket that listens for browsers.
 
@@ -280,9 +276,8 @@ class Proxy:
 
     def _run(self) -> None:
         """Run the server in the thread."""
-        options = {"sock": self._listener, "limit": _MAX_HEAD}
         with asyncio.Runner(loop_factory=lambda: self._loop) as runner:
-            runner.run(asyncio.start_server(self._answer, **options))
+            runner.run(asyncio.start_server(self._answer, sock=self._listener, limit=_MAX_HEAD))
             self._loop.run_forever()
 
     async def _answer(self, reader: StreamReader, writer: StreamWriter) -> None:
@@ -302,8 +297,7 @@ class Proxy:
         self, request: Head, admitted: AdmittedRequest, reader: StreamReader, writer: StreamWriter
     ) -> None:
         """Forward a request to the viewer and its answer to the browser, until one side closes."""
-        connection = asyncio.open_unix_connection(self._viewer, limit=_MAX_HEAD)
-        viewer, to_viewer = await connection
+        viewer, to_viewer = await asyncio.open_unix_connection(self._viewer, limit=_MAX_HEAD)
         try:
             to_viewer.write(_viewer_head(request, admitted).encode())
             answer = Head.parse(await viewer.readuntil(b"\r\n\r\n"))

@@ -164,8 +164,7 @@ def _opponents(
         """A new policy; its label has the role if another policy has the name as its title."""
         is_taken = name in {policy.title for policy in policies}
         label = f"{name} ({role})" if is_taken else None
-        changes = {"name": name, "label": label, "options": options, "track": None}
-        return residual.replace(**changes)
+        return residual.replace(name=name, label=label, options=options, track=None)
 
     bases = policies_named(description.base)
     same = [p for p in bases if _without_none(p.options) == options]
@@ -174,8 +173,6 @@ def _opponents(
     policies = [*policies, base]
     environment = ENVIRONMENTS.get(description.robot)
     best = best_analytic(environment is not None and environment.walks)
-    if best is None:
-        return base, None
     is_base = best == description.base
     for rival in policies_named(best):
         rival_options = _without_none(rival.options)

@@ -172,8 +172,7 @@ def _endpoint() -> str | None:
 def _require_small(hub: Any, repository: str, revision: str) -> None:
     """Refuse a repository without the files of a residual, or with files that are too large."""
     api = hub.HfApi(endpoint=_endpoint())
-    options = {"revision": revision, "files_metadata": True, "timeout": _TIMEOUT_S}
-    info = api.model_info(repository, **options)
+    info = api.model_info(repository, revision=revision, files_metadata=True, timeout=_TIMEOUT_S)
     sizes = {file.rfilename: file.size for file in info.siblings or []}
     for name, most in _MOST_BYTES.items():
         if name not in sizes:

@@ -252,12 +252,14 @@ def draw_static_errors(evaluations: Evaluations, model: RobotModel, path: Path) 
         style |= open_dots if index else {"color": shade}
         low = error.min()
         high = error.max()
-        paper_range = _paper_range_text(policy)
-        label = f"{label_text(policy)}: {low:+.1f} to {high:+.1f} mrad{paper_range}"
+        label = f"{label_text(policy)}: {low:+.1f} to {high:+.1f} mrad"
+        paper_range = _PAPER_RANGES_MRAD.get(policy, ())
+        if paper_range:
+            label += " (paper, dotted: {:+.1f} to {:+.1f})".format(*paper_range)
         torque = link_torque(points, gravity, points.q)
         axis.scatter(torque, error, s=34, label=label, **style)
         axis.axhspan(low, high, color=shade, alpha=0.08, lw=0)
-        for bound in _PAPER_RANGES_MRAD.get(policy, ()):
+        for bound in paper_range:
             axis.axhline(bound, color=shade, lw=0.9, ls=":")
     axis.set_title(f"Link error at rest, scenario {evaluations[0].condition.scenario}")
     axis.set_xlabel("gravity torque at the link angle [N·m]")
@@ -270,10 +272,3 @@ def static_errors(evaluation: Evaluation) -> Array:
     """Link error by the IMU, averaged over each window at rest, (visits,) [rad]."""
     assert evaluation.points is not None
     return evaluation.rest_references - evaluation.points.q
-
-
-def _paper_range_text(policy: str) -> str:
-    if policy not in _PAPER_RANGES_MRAD:
-        return ""
-    low, high = _PAPER_RANGES_MRAD[policy]
-    return f" (paper, dotted: {low:+.1f} to {high:+.1f})"

@@ -44,8 +44,7 @@ def draw_identification(
     gravities = [make_gravity(model) for model in models]
     torque = link_torque(points, gravities, result.link_angles(points))
     deflection = points.theta - points.q
-    shape = {"sharex": True, "height_ratios": (3, 1.2)}
-    figure, (top, bottom) = new_figure(2, 1, (7.2, 6.4), **shape)
+    figure, (top, bottom) = new_figure(2, 1, (7.2, 6.4), sharex=True, height_ratios=(3, 1.2))
     line = np.linspace(torque.min() - 3.0, torque.max() + 3.0, 400)
     for direction, marker, face, label in (
         (1, "^", _FIT_COLOUR, "approached from below"),
@@ -76,8 +75,7 @@ def draw_identification(
         f"offset {MRAD * result.offset_rad:+.2f} mrad",
         f"Pearson r {result.pearson_r:.4f}",
     )
-    place = {"transform": top.transAxes, "va": "top", "fontsize": 9}
-    top.text(0.03, 0.95, "\n".join(texts), **place)
+    top.text(0.03, 0.95, "\n".join(texts), transform=top.transAxes, va="top", fontsize=9)
     top.set_ylabel("deflection θ − q [mrad]")
     top.legend(loc="lower right")
     bottom.axhline(0.0, color=_LINE_COLOUR, lw=0.8)
@@ -148,25 +146,20 @@ def _draw_joint(axis: Any, predicted: Array, measured: Array) -> None:
 
 
 def _draw_residuals(axis: Any, fit: ArmFit) -> None:
-    unit = MEASUREMENT_UNITS[fit.model.log.kind]
+    log = fit.model.log
+    unit = MEASUREMENT_UNITS[log.kind]
     factor, shown_unit = (1.0, unit) if unit == "N·m" else (1e3, f"m{unit}")
     poses = np.arange(1, len(fit.residual) + 1)
-    names = _column_names(fit)
+    names = ("tilt 1", "tilt 2") if log.kind == "imu" else log.columns
     for column, name in zip(fit.residual.T, names, strict=True):
         axis.plot(poses, factor * column, ".", ms=4, label=label_text(name))
     axis.axhline(0.0, color=_LINE_COLOUR, lw=0.8)
     spread = f"spread {factor * fit.spread:.3g} {shown_unit}"
     axis.set_title(f"residual [{shown_unit}] by pose\n{spread}", fontsize=9)
     if len(names) <= _MOST_NAMED_COLUMNS:
-        close = {"handletextpad": 0.1, "columnspacing": 0.6}
-        axis.legend(fontsize=7, ncols=3, loc="upper right", **close)
+        axis.legend(fontsize=7, ncols=3, loc="upper right", handletextpad=0.1, columnspacing=0.6)
     else:
         axis.set_xlabel("a colour per joint, in their order", fontsize=8)
-
-
-def _column_names(fit: ArmFit) -> tuple[str, ...]:
-    log = fit.model.log
-    return ("tilt 1", "tilt 2") if log.kind == "imu" else log.columns
 
 
 def _stiffness_text(joint: Any) -> str:

@@ -26,10 +26,6 @@ _STRONGEST_CHANGE = 1.0
 """Share of a colour in the strongest square, and the smallest change that has this share."""
 _BEST_SHARE = 0.32
 """Share of a policy's colour in a square that it wins."""
-_NO_BREAK_SPACE = "\N{NO-BREAK SPACE}"
-
-
-Ends = tuple[float, float]
 
 
 @dataclass(frozen=True)
@@ -151,7 +147,7 @@ def _change_square(cell: MapCell, title: str, letters: Mapping[str, str]) -> Squ
     return Square(text, f"{small}{falls}".strip(), colour)
 
 
-def _score_square(cell: MapCell, title: str, column: Column, ends: Ends) -> Square:
+def _score_square(cell: MapCell, title: str, column: Column, ends: tuple[float, float]) -> Square:
     failures = _failures_text(cell.failed.get(title, (0, 0))).strip()
     if title not in cell.levels or not cell.levels[title].is_known:
         return Square("-", failures, _EMPTY)
@@ -206,7 +202,7 @@ def _draw_panel(axis: Any, panel: Panel) -> None:
         axis.spines[side].set_visible(False)
     if panel.key:
         entries = (f"{letter} {title}" for letter, title, _ in panel.key)
-        text = "   ".join(entry.replace(" ", _NO_BREAK_SPACE) for entry in entries)
+        text = "   ".join(entry.replace(" ", "\N{NO-BREAK SPACE}") for entry in entries)
         place = {"xycoords": "axes fraction", "textcoords": "offset points"}
         below = _wrap(text, 60)
         axis.annotate(below, (0.0, 0.0), (0, -34), fontsize=8, va="top", **place)

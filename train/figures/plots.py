@@ -79,12 +79,10 @@ def draw_chart(chart: Chart, path: Path) -> Path:
     """
     heights = [panel.height for panel in chart.panels]
     size = (chart.width, sum(heights) + 1.2)
-    shape = {"sharex": True, "height_ratios": heights}
-    figure, axes = new_figure(len(heights), 1, size, **shape)
+    figure, axes = new_figure(len(heights), 1, size, sharex=True, height_ratios=heights)
     for axis, panel in zip(axes, chart.panels, strict=True):
-        shade = {"color": "#e9ebee", "lw": 0, "zorder": 0, "label": chart.shade_name}
         for begin, end in chart.shaded:
-            axis.axvspan(begin, end, **shade)
+            axis.axvspan(begin, end, color="#e9ebee", lw=0, zorder=0, label=chart.shade_name)
         _draw_panel(axis, panel)
         axis.grid(axis="x", visible=chart.ticks is not None)
         if chart.ticks is None:

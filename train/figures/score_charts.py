@@ -128,8 +128,7 @@ def trials_chart(trials: Sequence[Any], columns: Sequence[Column], title: str) -
         sums = np.nansum(values, axis=1)
         means = np.where(counts > 0, sums / np.maximum(counts, 1), np.nan)
         curves = [Curve("", "#8fbbd9", numbers, robot, width=0.9) for robot in values.T]
-        look = {"width": 2.0, "has_points": True}
-        curves.append(Curve("mean", "#2a6f97", numbers, means, **look))
+        curves.append(Curve("mean", "#2a6f97", numbers, means, width=2.0, has_points=True))
         limits = (0.0, 1.05 * float(np.nanmax(values, initial=1e-9)))
         panels.append(Panel(column.label, curves, limits))
     return Chart(title, "trials learned from", panels, width=7.0)

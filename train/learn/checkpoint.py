@@ -109,15 +109,13 @@ def write_state(folder: Path, name: str, state: Any) -> None:
     """Write a state as `name.npz` and `name.json`."""
     arrays: dict[str, Array] = {}
 
-    def to_json(value: Any) -> Any:
-        if isinstance(value, np.ndarray):
-            arrays[key := f"a{len(arrays)}"] = value
-            return {_ARRAY_KEY: key}
-        if isinstance(value, dict):
-            return {name: to_json(part) for name, part in value.items()}
-        return [to_json(part) for part in value] if isinstance(value, list) else value
+    def to_json(value: Any) -> dict[str, str]:
+        if not isinstance(value, np.ndarray):
+            raise TypeError(f"Object of type {type(value).__name__} is not JSON serializable")
+        arrays[key := f"a{len(arrays)}"] = value
+        return {_ARRAY_KEY: key}
 
-    text = json.dumps(to_json(state))
+    text = json.dumps(state, default=to_json)
     np.savez(folder / f"{name}.npz", **arrays)  # type: ignore[arg-type]
     (folder / f"{name}.json").write_text(text)
 
@@ -126,11 +124,7 @@ def read_state(folder: Path, name: str) -> Any:
     """Read a state that `write_state` wrote; no code from the files is run."""
     with np.load(folder / f"{name}.npz", allow_pickle=False) as arrays:
 
-        def from_json(value: Any) -> Any:
-            if isinstance(value, dict):
-                if set(value) == {_ARRAY_KEY}:
-                    return arrays[value[_ARRAY_KEY]]
-                return {name: from_json(part) for name, part in value.items()}
-            return [from_json(v) for v in value] if isinstance(value, list) else value
+        def from_json(value: dict[str, Any]) -> Any:
+            return arrays[value[_ARRAY_KEY]] if set(value) == {_ARRAY_KEY} else value
 
-        return from_json(json.loads((folder / f"{name}.json").read_text()))
+        return json.loads((folder / f"{name}.json").read_text(), object_hook=from_json)

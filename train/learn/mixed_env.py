@@ -147,8 +147,8 @@ class MixedVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
 def mixed_env(
     conditions: Sequence[Condition],
     sizes: Sequence[int],
-    num_threads: int = 0,
-    weights: Sequence[float] | None = None,
+    num_threads: int,
+    weights: Sequence[float],
 ) -> MixedVectorEnv:
     """Worlds of several conditions; neighbours with the same settings share an environment.
 
@@ -156,7 +156,7 @@ def mixed_env(
         conditions: Cells of one environment and motion; their policies are not used.
         sizes: Number of worlds of each condition.
         num_threads: Threads of the physics, 0 for the number of cores.
-        weights: Factor of the rewards of each condition; None for equal ones.
+        weights: Factor of the rewards of each condition.
 
     Raises:
         ConfigurationError: A name or an option does not exist.
@@ -166,8 +166,7 @@ def mixed_env(
     threads = thread_counts(_num_cores(num_threads), len(groups))
     mode = AutoresetMode.DISABLED
     envs = [make_shared_env(*each, mode) for each in zip(groups, threads, strict=True)]
-    world_weights = None if weights is None else np.repeat(weights, sizes).tolist()
-    return MixedVectorEnv(envs, num_threads, world_weights)
+    return MixedVectorEnv(envs, num_threads, np.repeat(weights, sizes).tolist())
 
 
 def _mixture_error(requirement: str) -> ConfigurationError:

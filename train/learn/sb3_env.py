@@ -47,8 +47,7 @@ class SB3VecEnv(VecEnv):
         self._length = np.zeros(env.num_envs, dtype=np.int64)
         self._total = 0.0
         self._steps = 0
-        spaces = (env.single_observation_space, env.single_action_space)
-        super().__init__(env.num_envs, *spaces)
+        super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
 
     def reset(self) -> Any:
         """Begin an episode in every world, with the seeds of the last call of `seed`."""

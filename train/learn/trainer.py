@@ -173,8 +173,7 @@ class Trainer(ABC):
         current = self._keep_policy("current")
         columns = [column.metric for column in environment(self.config.env).judged]
         if self._base is None:
-            policy = self.config.base
-            self._base = play_scenarios(self.config, policy, columns, self._threads)
+            self._base = play_scenarios(self.config, self.config.base, columns, self._threads)
         base, base_failed = self._base
         mine, failed = self._base
         if self.done > 0:

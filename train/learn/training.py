@@ -9,7 +9,6 @@ uninterrupted one.
 import io
 import random
 import warnings
-from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -156,8 +155,8 @@ class Training(Trainer):
             "model": {name: getattr(model, name) for name in _MODEL_ATTRIBUTES},
             "statistics": [[s.mean, s.var, float(s.count)] for s in self._statistics],
             "best": self._best,
-            "numpy": _tuples_to_lists(np.random.get_state()),  # noqa: NPY002
-            "python": _tuples_to_lists(random.getstate()),
+            "numpy": np.random.get_state(),  # noqa: NPY002
+            "python": random.getstate(),
             "actions": model.action_space.np_random.bit_generator.state,
         }
         if isinstance(model, OffPolicyAlgorithm):
@@ -176,11 +175,9 @@ class Training(Trainer):
             rms.mean, rms.var, rms.count = values
         self._best = state["best"]
         np.random.set_state(tuple(state["numpy"]))  # noqa: NPY002
-        random.setstate(_lists_to_tuples(state["python"]))
+        version, words, gauss = state["python"]
+        random.setstate((version, tuple(words), gauss))
         model.action_space.np_random.bit_generator.state = state["actions"]
-        if model.ep_info_buffer is None:
-            model.ep_info_buffer = deque(maxlen=100)
-            model.ep_success_buffer = deque(maxlen=100)
         if isinstance(model, OffPolicyAlgorithm):
             buffer: Any = model.replay_buffer
             for name, values in state["replay"].items():
@@ -251,11 +248,3 @@ def _resolve_activation(options: dict[str, Any]) -> dict[str, Any]:
     if isinstance(policy.get("activation_fn"), str):
         policy["activation_fn"] = getattr(torch.nn, policy["activation_fn"])
     return {**options, "policy_kwargs": policy}
-
-
-def _tuples_to_lists(value: Any) -> Any:
-    return list(map(_tuples_to_lists, value)) if isinstance(value, tuple) else value
-
-
-def _lists_to_tuples(value: Any) -> Any:
-    return tuple(map(_lists_to_tuples, value)) if isinstance(value, list) else value

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from rich.console import Console
@@ -58,8 +57,7 @@ def cells_table(rows: Sequence[Change]) -> Table:
     is_one = len(policies) == 1
     kind = "residual" if rows[0].is_family else "policy"
     names = [*([] if is_one else [kind]), "reference", "scenario"]
-    words: dict[str, Any] = {"is_number": False, "wraps": True}
-    heads = [Head(name, titles=name == "reference", **words) for name in names]
+    heads = [Head(name, titles=name == "reference", is_number=False, wraps=True) for name in names]
     heads += [Head(name.replace("_", " ")) for name in swept]
     heads += [Head(column.title, leaves=1) for column in columns]
     heads += [Head(f"{rows[0].failure} ({'other' if rows[0].is_rival else 'base'})")]

@@ -20,7 +20,7 @@ from train.evaluate.leaderboard_rows import PairedChange, Standing
 from train.evaluate.scores import best_of
 from train.evaluate.statistics import Estimate
 from train.report.page import TEXTS, Page
-from train.report.report_text import capital
+from train.report.report_text import capital, span
 from train.report.tables import Head, Part, Row, Table
 from train.report.terminal import print_table
 from train.runs.escaping import write_records
@@ -168,8 +168,7 @@ def _legend(standings: Sequence[Standing]) -> str:
     meaning = _metric_labels([s for s in standings if s.is_column])
     single = [s for s in standings if not s.is_group]
     counts = sorted({s.episodes // max(s.training_seeds, 1) for s in single})
-    span = f"{counts[0]} to {counts[-1]}" if len(counts) > 1 else str(counts[0])
-    episodes = f"episodes of a scenario, per training seed: {span}"
+    episodes = f"episodes of a scenario, per training seed: {span(counts)}"
     over = dict.fromkeys(s.interval_over for s in standings if s.interval_over)
     within = f" over {', or '.join(over)}"
     if len(over) > _MAX_INTERVAL_KINDS:

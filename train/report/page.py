@@ -13,8 +13,7 @@ from train.report.tables import Table
 from train.report.templates import load_template
 from train.runs.escaping import markdown_text
 
-_FILE = Path(__file__).with_name("texts.toml")
-TEXTS = tomllib.loads(_FILE.read_text(encoding="utf-8"))
+TEXTS = tomllib.loads(Path(__file__).with_name("texts.toml").read_text(encoding="utf-8"))
 """Paragraphs by section or table."""
 _PICTURE_TYPES = {".png": "png", ".svg": "svg+xml"}
 """Types of pictures that a page shows, by the suffix of their files."""

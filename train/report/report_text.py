@@ -190,7 +190,7 @@ def facts(results: Results) -> list[tuple[str, str]]:
     per_cell = sorted({len(e.episodes) for e in results.evaluations})
     versions = [f"{name} {v}" for name, v in origin["versions"].items() if v]
     each = " and training seed" if table.members else ""
-    played = f"{_span(per_cell)} per cell{each}, seeds {_span(sorted({min(seeds), max(seeds)}))}"
+    played = f"{span(per_cell)} per cell{each}, seeds {span(sorted({min(seeds), max(seeds)}))}"
     return [
         ("policies", ", ".join(table.policies)),
         (f"{table.environment.quantity or 'reference'}s", ", ".join(table.references)),
@@ -212,7 +212,8 @@ def _training_text(origin: Origin) -> str:
     return f"{seeds}, trained on {on}{motion}; {where}; commit {commits}"
 
 
-def _span(numbers: Sequence[int]) -> str:
+def span(numbers: Sequence[int]) -> str:
+    """Return the ends of rising numbers: 4, or 4 to 8."""
     return str(numbers[0]) if len(numbers) == 1 else f"{numbers[0]} to {numbers[-1]}"
 
 

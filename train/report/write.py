@@ -196,8 +196,7 @@ def _add_sweeps(page: Page, results: Results) -> None:
     if charts:
         page.section("Sweeps", _text(results, "sweeps"))
     for number, chart in enumerate(charts.values()):
-        folding = {"is_folded": True, "is_open": number == 0}
-        page.add("chart", page_chart(chart), chart.title, **folding)
+        page.add("chart", page_chart(chart), chart.title, is_folded=True, is_open=number == 0)
 
 
 def _cell_score(cell: Sequence[Evaluation], column: Column) -> Estimate:

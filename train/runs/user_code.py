@@ -13,7 +13,6 @@ import sys
 import traceback
 from collections.abc import Callable, Mapping
 from contextvars import ContextVar
-from functools import partial
 from pathlib import Path
 from types import ModuleType
 from typing import Any, TypeVar
@@ -76,20 +75,10 @@ class CodeNamingModel(Model):
 
 
 _Config = TypeVar("_Config", bound=CodeNamingModel)
-_MODULE_PREFIX = "elastic_user_file_"
 _ROOT = Path(__file__).parents[2]
 _OWN_FOLDERS = tuple(_ROOT / name for name in ("elastic_env", "baselines", "train"))
-_Refuse = Callable[[str], None]
-_CODE_CHECK: ContextVar[_Refuse] = ContextVar("code_check", default=lambda _: None)
+_CODE_CHECK: ContextVar[Callable[[str], None]] = ContextVar("code_check", default=lambda _: None)
 """Called with each name before its code runs."""
-_TRUST = "say --trust-code, or name a configuration of yours"
-"""Cure for a user who trusts the folder of a run."""
-
-
-def _refuse(file: Path, cure: str, name: str) -> None:
-    """Refuse a name of code in a file that must not run code."""
-    problem = f"{file} names {quote(name)}, whose code would run"
-    raise ConfigurationError(f"{problem}; look at it, then {cure}")
 
 
 def load_without_code(file: Path, kind: type[_Config], cure: str) -> _Config:
@@ -103,7 +92,11 @@ def load_without_code(file: Path, kind: type[_Config], cure: str) -> _Config:
     Raises:
         ConfigurationError: The file is no such configuration, or it names code.
     """
-    refuse = partial(_refuse, file, cure)
+
+    def refuse(name: str) -> None:
+        problem = f"{file} names {quote(name)}, whose code would run"
+        raise ConfigurationError(f"{problem}; look at it, then {cure}")
+
     token = _CODE_CHECK.set(refuse)
     try:
         config = load_yaml(file, kind)
@@ -129,7 +122,7 @@ def recorded_config(folder: Path, kind: type[_Config], trust_code: bool = False)
     file = require_run(folder)
     if trust_code:
         return load_yaml(file, kind)
-    return load_without_code(file, kind, _TRUST)
+    return load_without_code(file, kind, "say --trust-code, or name a configuration of yours")
 
 
 def named_object(name: str) -> Any:
@@ -200,7 +193,7 @@ def _import_module(module: str) -> ModuleType:
 def _import_file(path: Path) -> ModuleType:
     """Import a file under a name with a prefix, so that train.py does not hide our package."""
     resolved = path.resolve()
-    name = _MODULE_PREFIX + resolved.stem
+    name = f"elastic_user_file_{resolved.stem}"
     imported = sys.modules.get(name)
     if imported is not None and imported.__file__ == str(resolved):
         return imported

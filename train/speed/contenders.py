@@ -93,8 +93,7 @@ class VectorLoop(_OurLoop):
         self.num_envs = num_envs
         self._condition = make_condition(env, policy)
         super().__init__(make_vector_env(self._condition, num_envs, threads, **backend))
-        spec = self._condition.policy
-        self._policy = None if policy is None else make_policy(spec, self.env)
+        self._policy = None if policy is None else make_policy(self._condition.policy, self.env)
         if residual:
             self._policy = untrained_residual(self._policy, self.env)
         self._state: Any = None

@@ -78,8 +78,7 @@ class PPOLoop(Contender):
             venv: Any = SubprocVecEnv([maker] * num_envs, start_method="spawn")
         else:
             condition = make_condition(env, policy)
-            mode = AutoresetMode.SAME_STEP
-            inner = make_vector_env(condition, num_envs, threads, mode)
+            inner = make_vector_env(condition, num_envs, threads, AutoresetMode.SAME_STEP)
             base = make_policy(condition.policy, inner)
             residual = ResidualVectorWrapper(inner, base, acts_on=residual_input(base))
             venv = SB3VecEnv(residual)

@@ -51,8 +51,7 @@ class _Player:
 
     def __init__(self, condition: Condition) -> None:
         self._env = make_vector_env(condition, 1, num_threads=1)
-        options = condition.policy_options
-        self._policy = make_policy(condition.policy, self._env, options)
+        self._policy = make_policy(condition.policy, self._env, condition.policy_options)
         self._spent_s = 0.0
         self._steps = control_steps(self._env, self, condition.seed)
 

@@ -39,9 +39,8 @@ def dask_pool(address: str) -> Iterator[Pool]:
     warn_of_public(address)
     # lost workers are reported by this program
     logging.getLogger("distributed").setLevel(logging.CRITICAL)
-    options = {"timeout": _CONNECT_S, "set_as_default": False}
     try:
-        client = distributed.Client(f"tcp://{address}", **options)
+        client = distributed.Client(f"tcp://{address}", timeout=_CONNECT_S, set_as_default=False)
     except (OSError, ValueError) as error:
         problem = f"no dask scheduler answers at {address} ({error})"
         cure = "start one there with: dask scheduler --host ADDRESS"

@@ -5,6 +5,7 @@ import pickle
 import platform
 import traceback
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,10 +27,7 @@ def run_remote_call(
     The worker changes to the program's folder if this machine has it, since configurations name
     files from there. A machine whose versions differ from the program's is refused.
     """
-
-    def report(value: Any) -> None:
-        reporter(number, value)
-
+    report = partial(reporter, number)
     try:
         require_same(versions, everything(), platform.node())
         if folder.is_dir():

@@ -101,7 +101,7 @@ class ServoBus(PacketLine):
         """Read a register [count].
 
         Raises:
-            ReplyError: No answer in three tries, or a refusal.
+            ReplyError: No answer after some tries, or a refusal.
         """
         register = self.models[servo_id].table[name]
         place = self._place(register.address, register.size)
@@ -112,7 +112,7 @@ class ServoBus(PacketLine):
         """Write a register [count].
 
         Raises:
-            ReplyError: No answer in three tries, or a refusal, with the servo's reason.
+            ReplyError: No answer after some tries, or a refusal, with the servo's reason.
         """
         register = self.models[servo_id].table[name]
         data = self._place(register.address) + register.encode(value)

@@ -1,4 +1,4 @@
-"""The start of an episode, as far as an observation shows it."""
+"""The first observation of an episode: how it is known, and required where there is no memory."""
 
 from typing import Any
 
