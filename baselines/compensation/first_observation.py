@@ -1,4 +1,4 @@
-"""The first observation of an episode: how it is known, and required where there is no memory."""
+"""The first observation of an episode: its signs, and a check of calls without memory."""
 
 from typing import Any
 

@@ -141,8 +141,6 @@ class Supervisor:
         if isinstance(self._fault, BusGoneError):
             # final: an adapter that is plugged in again is another port
             raise self._fault.with_traceback(None)
-        for bus in self._buses:
-            bus.reply_timeout_s = REPLY_TIMEOUT_S
         self._disable()
         safety_limits = SafetyLimits(**limits)
         servos = self._servos.servos
@@ -257,7 +255,11 @@ class Supervisor:
     def _torque_off(self) -> HardwareError | None:
         """Switch torque off at once, then ask for confirmation; return what remains uncertain."""
         self._guard = None
-        return self._servos.torque_off(self._send_busy)
+        problem = self._servos.torque_off(self._send_busy)
+        # what follows has the time that replies have at rest
+        for bus in self._buses:
+            bus.reply_timeout_s = REPLY_TIMEOUT_S
+        return problem
 
     def _send_busy(self) -> None:
         """Announce to the program that torque off takes longer.
